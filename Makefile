@@ -1,0 +1,85 @@
+# Front door. `make help` lists the targets; V=1 shows the commands.
+BUILD ?= build
+export BUILD
+VENV := $(BUILD)/venv
+PYTHON := $(VENV)/bin/python
+FLOTILLA := $(PYTHON) -m images.builder
+Q := $(if $(filter-out 0,$(V)),,@)
+export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS
+MAKEFLAGS += --no-print-directory
+.DEFAULT_GOAL := help
+
+##@ Cards
+.PHONY: image images flash boot ssh verify size
+image: | setup ## card image of one robot: make image ROBOT=3
+	$(Q)$(FLOTILLA) image --robot $(call need,ROBOT)
+
+images: | setup ## card images of the whole fleet
+	$(Q)$(FLOTILLA) image --all
+
+flash: | setup ## write a card and read it back: make flash ROBOT=3 DEV=/dev/sdX (or CARD=file)
+	$(Q)$(FLOTILLA) flash --robot $(call need,ROBOT) $(if $(CARD),--file $(CARD),--device $(call need,DEV)) $(if $(FORCE),--force $(FORCE))
+
+boot: | setup-tests ## boot a robot's image in QEMU on this terminal
+	$(Q)$(FLOTILLA) boot --robot $(call need,ROBOT)
+
+ssh: | setup ## shell on a robot, or on its guest when `make boot` runs: make ssh ROBOT=3
+	$(Q)$(FLOTILLA) ssh --robot $(call need,ROBOT)
+
+verify: | setup ## build a second time under other circumstances and compare to the byte
+	$(Q)$(FLOTILLA) verify --robot $(call need,ROBOT)
+
+size: | setup ## the largest packages and files of a robot's image
+	$(Q)$(FLOTILLA) size --robot $(call need,ROBOT)
+
+##@ Inputs
+.PHONY: lock check-fleet requirements
+lock: | setup ## resolve the package lists against the mirror: exact versions and hashes
+	$(Q)$(FLOTILLA) lock
+
+check-fleet: | setup ## validate the fleet's description
+	$(Q)$(FLOTILLA) check-fleet
+
+requirements: | setup ## lock the Python environment anew from requirements.in
+	$(Q)$(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	    --no-header --no-annotate --quiet requirements.in -o requirements.lock
+
+##@ Quality
+.PHONY: check test bench
+check: | setup-tests ## lint, types and unit tests, under a minute
+	$(Q)$(VENV)/bin/ruff format --check .
+	$(Q)$(VENV)/bin/ruff check .
+	$(Q)$(VENV)/bin/mypy
+	$(Q)$(call shell_scripts) | xargs shellcheck
+	$(Q)PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/ansible-lint --offline -q ansible
+	$(Q)$(VENV)/bin/pytest -q tests/unit
+
+test: | setup-tests ## everything: checks, images, boots in QEMU
+	$(Q)$(MAKE) check
+	$(Q)$(FLOTILLA) image --all
+	$(Q)$(VENV)/bin/pytest tests
+
+bench: | setup-tests ## wall times and ratios against other builders
+	$(Q)$(FLOTILLA) bench
+
+##@ Housekeeping
+.PHONY: setup setup-tests clean help
+setup: $(VENV)/.complete ## install what building needs
+
+setup-tests: setup ## install what testing needs
+	$(Q)images/install-host-packages tests/host-packages.txt
+
+$(VENV)/.complete: requirements.lock images/host-packages.txt
+	$(Q)images/install-host-packages images/host-packages.txt
+	$(Q)python3 -m venv --clear $(VENV)
+	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r requirements.lock
+	$(Q)touch $@
+
+clean: ## remove all outputs; keys stay
+	$(Q)rm -rf $(BUILD)
+
+help: ## this list
+	@awk -F ':.*## ' '/^##@/ {printf "\n%s\n", substr($$0, 5)} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+need = $(or $($1),$(error say which: make $@ $1=…))
+shell_scripts = git grep -l -E '^\#!/bin/(ba)?sh' -- images rootfs_overlay tests .ci

@@ -1,0 +1,32 @@
+"""Where things lie. Every other module asks here; `BUILD` and `KEYS` come from the environment."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+PROJECT = Path(__file__).resolve().parents[2]
+BUILD = Path(os.environ.get("BUILD", PROJECT / "build")).resolve()
+"""All outputs. Removing it loses nothing that cannot be made again."""
+KEYS = Path(os.environ.get("KEYS", PROJECT / "ansible" / "keys")).resolve()
+"""Private keys: made once, never in git, never removed by `make clean`."""
+
+POOL = BUILD / "pool"
+"""Debian packages by SHA-256, shared by all boards."""
+CACHE = BUILD / "cache"
+"""Results of build steps, named by the hash of what went into them."""
+IMAGES = BUILD / "images"
+"""Card images with what belongs to them."""
+
+INVENTORY = PROJECT / "ansible" / "inventory"
+OVERLAY = PROJECT / "rootfs_overlay"
+PACKAGES = PROJECT / "images" / "packages"
+LOCKS = PROJECT / "images" / "locks"
+
+
+def shown(path: Path) -> str:
+    """The path as a message should show it: relative to the project where it lies inside."""
+    try:
+        return str(path.relative_to(PROJECT))
+    except ValueError:
+        return str(path)
