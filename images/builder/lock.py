@@ -1,0 +1,421 @@
+"""Locks: exactly which Debian packages an image is made of, resolved by apt and verified by the archive's signatures."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import subprocess
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from pathlib import Path
+from typing import Literal, get_args
+from urllib.parse import unquote
+
+from images.builder import mirror, paths, progress
+from images.builder.errors import UserError
+from images.builder.mirror import DEBIAN, SECURITY, Mirrors
+
+SUITE = "bookworm"
+"""The last Debian with i386 kernels."""
+_SUITES = ((DEBIAN, SUITE), (DEBIAN, f"{SUITE}-updates"), (SECURITY, f"{SUITE}-security"))
+_COMPONENTS = "main non-free-firmware"
+_KEYRINGS = tuple(Path("/usr/share/keyrings", f"debian-archive-keyring.{suffix}") for suffix in ("gpg", "pgp"))
+_DATE = "%Y-%m-%dT%H:%M:%SZ"
+
+Role = Literal["required", "userland", "kernel"]
+"""`required`: Essential, or of that priority in the archive's index; `kernel`: not installed with its dependencies."""
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """How a lock comes about."""
+
+    architecture: str
+    lists: tuple[str, ...]
+    system: bool = True
+    """Whether it is a system to bootstrap, which needs what is essential or required, and apt."""
+
+
+_RECIPES = {
+    "smartcoret3": _Recipe("i386", ("robot", "smartcoret3")),
+    "x86_64": _Recipe("amd64", ("robot", "x86_64")),
+    "tools": _Recipe("amd64", ("tools",), system=False),
+}
+NAMES = tuple(_RECIPES)
+
+
+@dataclass(frozen=True, order=True)
+class Package:
+    """One package at one version: a line of a lock."""
+
+    name: str
+    version: str
+    architecture: str
+    role: Role
+    archive: str
+    size: int
+    sha256: str
+    path: str
+    """Below the archive's base: `pool/main/…`."""
+
+    @property
+    def file(self) -> Path:
+        """Where the pool keeps it."""
+        return paths.POOL / f"{self.sha256}.deb"
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.version} ({self.architecture})"
+
+
+@dataclass(frozen=True, order=True)
+class Suite:
+    """A suite as it was when the lock was made."""
+
+    archive: str
+    name: str
+    date: datetime
+    """Of its Release file, UTC."""
+
+
+@dataclass(frozen=True)
+class Lock:
+    name: str
+    architecture: str
+    suites: tuple[Suite, ...]
+    packages: tuple[Package, ...]
+
+    @property
+    def epoch(self) -> int:
+        """SOURCE_DATE_EPOCH of everything made from this lock: when its newest suite was released."""
+        return int(max(suite.date for suite in self.suites).timestamp())
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the lock's text: names whatever is made from it."""
+        return hashlib.sha256(format_lock(self).encode()).hexdigest()
+
+    def date(self, archive: str) -> datetime:
+        """When an archive's newest suite was released."""
+        return max(suite.date for suite in self.suites if suite.archive == archive)
+
+    def having(self, *roles: Role) -> tuple[Package, ...]:
+        """The packages of some roles."""
+        return tuple(package for package in self.packages if package.role in roles)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """One line of a package list."""
+
+    package: str
+    kernel: bool
+    reason: str
+
+
+# --- text ---
+
+_HEADER = "# Made by `make lock`; the lists are in images/packages/."
+_COLUMNS = [column.name for column in dataclasses.fields(Package)]
+_VALID = {
+    "name": r"[a-z0-9][a-z0-9+.-]+",
+    "version": r"[0-9][A-Za-z0-9.+~:-]*",
+    "architecture": r"i386|amd64|all",
+    "role": "|".join(get_args(Role)),
+    "archive": "|".join(map(re.escape, mirror.ARCHIVES)),
+    "size": r"[1-9][0-9]*",
+    "sha256": r"[0-9a-f]{64}",
+    "path": r"pool/(?!.*\.\.)[A-Za-z0-9.+~_/-]+\.deb",  # `..` would leave the pool
+}
+
+
+def lock_file(name: str) -> Path:
+    return paths.LOCKS / f"{name}.lock"
+
+
+def read_lock(name: str) -> Lock:
+    """The lock of a board, or of the build tools."""
+    path = lock_file(name)
+    if not path.is_file():
+        raise UserError(f"{paths.shown(path)}: missing; `make lock` writes the locks of {', '.join(NAMES)}")
+    return parse_lock(path.read_text(encoding="utf-8"), name, paths.shown(path))
+
+
+def parse_lock(text: str, name: str, shown: str) -> Lock:
+    """The lock that `text` describes; `shown` names the file in errors."""
+    architecture = ""
+    suites: list[Suite] = []
+    packages: dict[str, Package] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        try:
+            match line.split(" "):
+                case [""] | ["#", *_]:
+                    pass
+                case ["architecture", value]:
+                    architecture = _valid("architecture", value)
+                case ["suite", archive, suite, date]:
+                    when = datetime.strptime(date, _DATE).replace(tzinfo=UTC)
+                    suites.append(Suite(_valid("archive", archive), suite, when))
+                case ["package", *values]:
+                    package = _package(values)
+                    if package.name in packages:
+                        raise ValueError(f"package {package.name} is locked twice")
+                    packages[package.name] = package
+                case _:
+                    raise ValueError(f"'{line}' is no architecture, suite or package")
+        except ValueError as error:
+            raise UserError(f"{shown}:{number}: {error}; mend the line or run `make lock`") from None
+    for what, value in {"architecture": architecture, "suite": suites, "package": packages}.items():
+        if not value:
+            raise UserError(f"{shown}: has no {what} line; restore it from git or run `make lock`")
+    return Lock(name, architecture, tuple(sorted(suites)), tuple(sorted(packages.values())))
+
+
+def format_lock(lock: Lock) -> str:
+    """The text of a lock: one package a line, so that a change reads well in git."""
+    lines = [_HEADER, f"architecture {lock.architecture}"]
+    lines += [f"suite {suite.archive} {suite.name} {suite.date.strftime(_DATE)}" for suite in sorted(lock.suites)]
+    lines += ["", f"# package {' '.join(_COLUMNS)}"]
+    lines += [f"package {' '.join(map(str, dataclasses.astuple(package)))}" for package in sorted(lock.packages)]
+    return "\n".join(lines) + "\n"
+
+
+def _valid(column: str, value: str) -> str:
+    if not re.fullmatch(_VALID[column], value):
+        raise ValueError(f"{column} '{value}' is malformed")
+    return value
+
+
+def _package(values: Sequence[str]) -> Package:
+    if len(values) != len(_COLUMNS):
+        raise ValueError(f"a package has {len(_COLUMNS)} values ({' '.join(_COLUMNS)}), not {len(values)}")
+    name, version, architecture, role, archive, size, sha256, path = map(_valid, _COLUMNS, values)
+    return Package(name, version, architecture, role, archive, int(size), sha256, path)  # type: ignore[arg-type]
+
+
+def read_list(name: str) -> list[Wish]:
+    """A package list: `[kernel] PACKAGE # reason` a line."""
+    path = paths.PACKAGES / f"{name}.list"
+    wishes = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        entry, _, reason = (part.strip() for part in line.partition("#"))
+        if not entry:
+            continue
+        match = re.fullmatch(rf"(kernel )?({_VALID['name']})", entry)
+        if not match or not reason:
+            raise UserError(
+                f"{paths.shown(path)}:{number}: '{line}': write `PACKAGE # reason` or `kernel PACKAGE # reason`"
+            )
+        wishes.append(Wish(match[2], bool(match[1]), reason))
+    return wishes
+
+
+def wishes(name: str) -> list[Wish]:
+    """What the lists of a lock ask for."""
+    return [wish for each in _RECIPES[name].lists for wish in read_list(each)]
+
+
+# --- resolution ---
+
+
+def update_locks(names: Iterable[str] = NAMES, mirrors: Mirrors | None = None, without: Collection[str] = ()) -> str:
+    """Resolve the package lists against the mirrors, write the locks and say what changed, a line each.
+
+    `without` names suites to leave out, for a mirror whose copy of one is broken: what a signature does not cover is never
+    used, so the choice is between fewer packages and none. The lock says which suites it was made from.
+    """
+    mirrors = mirrors or mirror.resolve()
+    changes = []
+    for name in names:
+        with progress.step(f"lock of {name}"):
+            new = resolve(name, mirrors, without)
+        path = lock_file(name)
+        old = read_lock(name) if path.is_file() else None
+        if old and old.packages == new.packages:
+            changes.append(f"{name}: unchanged")  # nor does its epoch change: the same packages, the same image
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_name(f".{path.name}.new")
+        beside.write_text(format_lock(new), encoding="utf-8")
+        beside.replace(path)
+        total = progress.size(sum(package.size for package in new.packages))
+        changes.append(f"{name}: {len(new.packages)} packages, {total}")
+        changes += [f"  {line}" for line in difference(old.packages if old else (), new.packages)]
+    return "\n".join(changes)
+
+
+def difference(old: Iterable[Package], new: Iterable[Package]) -> list[str]:
+    """What was added, removed or changed, a line each."""
+    before = {package.name: package.version for package in old}
+    after = {package.name: package.version for package in new}
+    return [
+        f"- {name} {before[name]}"
+        if name not in after
+        else f"+ {name} {after[name]}"
+        if name not in before
+        else f"  {name} {before[name]} -> {after[name]}"
+        for name in sorted(before.keys() | after.keys())
+        if before.get(name) != after.get(name)
+    ]
+
+
+def resolve(name: str, mirrors: Mirrors, without: Collection[str] = ()) -> Lock:
+    """Ask apt what the lists of a lock come to today."""
+    recipe = _RECIPES[name]
+    apt = Apt(recipe.architecture, mirrors, [suite for suite in _SUITES if suite[1] not in without])
+    apt.update()
+    asked = wishes(name)
+    index = apt.index()
+    required = {
+        fields["Package"]
+        for _, fields in index.values()
+        if fields.get("Essential") == "yes" or fields.get("Priority") == "required"
+    }
+    userland = {wish.package for wish in asked if not wish.kernel}
+    if recipe.system:
+        userland |= required | {"apt"}  # debootstrap's smallest variant holds these
+    selected: dict[str, Role] = {
+        path: "required" if index[path][1]["Package"] in required else "userland"
+        for path in apt.install(sorted(userland))
+    }
+    for wish in asked:
+        if wish.kernel:
+            selected[apt.path(apt.concrete(wish.package))] = "kernel"
+    packages = [
+        Package(
+            name=fields["Package"],
+            version=fields["Version"],
+            architecture=fields["Architecture"],
+            role=role,
+            archive=archive,
+            size=int(fields["Size"]),
+            sha256=fields["SHA256"],
+            path=path,
+        )
+        for path, role in selected.items()
+        for archive, fields in [index[path]]
+    ]
+    return Lock(name, recipe.architecture, apt.suites(), tuple(sorted(packages)))
+
+
+class Apt:
+    """apt as resolver and verifier, in a directory of its own: no root, and nothing of this computer's configuration
+    but its proxy."""
+
+    def __init__(self, architecture: str, mirrors: Mirrors, suites: Sequence[tuple[str, str]] = _SUITES) -> None:
+        self.architecture = architecture
+        self.sources = suites
+        self.archives = {archive: mirrors.of(archive) for archive, _ in suites}
+        self.directory = paths.BUILD / "apt" / architecture
+        keyring = next((path for path in _KEYRINGS if path.is_file()), None)
+        if not keyring:
+            raise UserError("the Debian archive's keys are missing: apt-get install debian-archive-keyring")
+        self._configure(keyring)
+
+    def _configure(self, keyring: Path) -> None:
+        for each in (
+            "etc/apt/apt.conf.d",
+            "etc/apt/preferences.d",
+            "var/lib/dpkg",
+            "var/lib/apt/lists/partial",
+            "var/cache/apt/archives/partial",
+        ):
+            (self.directory / each).mkdir(parents=True, exist_ok=True)
+        status = self.directory / "var/lib/dpkg/status"
+        status.write_text("")
+        sources = self.directory / "etc/apt/sources.list"
+        sources.write_text(
+            "".join(
+                f"deb [arch={self.architecture} signed-by={keyring}] {self.archives[archive]} {suite} {_COMPONENTS}\n"
+                for archive, suite in self.sources
+            )
+        )
+        settings = {
+            "Dir": f"{self.directory}/",
+            "Dir::State::status": str(status),
+            "APT::Architecture": self.architecture,
+            "APT::Architectures": self.architecture,
+            "APT::Install-Recommends": "false",
+            "APT::Install-Suggests": "false",
+            "APT::Sandbox::User": "root",  # there is no other user to drop to when it does not run as root
+            "APT::Update::Error-Mode": "any",  # an archive that cannot be read is no reason for an older lock
+            "Acquire::Languages": "none",
+            "Acquire::ForceHash": "sha256",
+            "Acquire::Retries": "3",
+        } | _proxies()
+        (self.directory / "apt.conf").write_text("".join(f'{key} "{value}";\n' for key, value in settings.items()))
+
+    def _run(self, *arguments: str) -> str:
+        progress.command(arguments)
+        environment = os.environ | {"APT_CONFIG": str(self.directory / "apt.conf"), "LC_ALL": "C.UTF-8"}
+        done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise UserError(f"{' '.join(arguments[:2])} failed:\n{(done.stderr or done.stdout).strip()}")
+        return done.stdout
+
+    def update(self) -> None:
+        """Fetch the indexes; apt verifies their signatures."""
+        self._run("apt-get", "update", "-q")
+
+    def index(self) -> dict[str, tuple[str, dict[str, str]]]:
+        """Archive and index stanza of every package that the archives hold, by path."""
+        return {
+            fields["Filename"]: (archive, fields)
+            for archive, suite in self.sources
+            for path in self._lists(archive, f"{suite}_*_Packages")
+            for fields in mirror.stanzas(path.read_text(encoding="utf-8"))
+        }
+
+    def suites(self) -> tuple[Suite, ...]:
+        """The suites with the dates of their Release files."""
+        return tuple(
+            Suite(archive, suite, parsedate_to_datetime(match[1]).astimezone(UTC))
+            for archive, suite in self.sources
+            for path in self._lists(archive, f"{suite}_*Release")
+            if (match := re.search(r"^Date: (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE))
+        )
+
+    def _lists(self, archive: str, pattern: str) -> list[Path]:
+        address = unquote(self.archives[archive]).partition("//")[2].replace("/", "_")
+        return sorted((self.directory / "var/lib/apt/lists").glob(f"{address}_dists_{pattern}"))
+
+    def install(self, names: Sequence[str]) -> list[str]:
+        """Paths of these packages and of all they depend on."""
+        return [
+            self._relative(line) for line in self._run("apt-get", "install", "-qq", "--print-uris", *names).splitlines()
+        ]
+
+    def path(self, name: str) -> str:
+        """Path of this package alone."""
+        return self._relative(self._run("apt-get", "download", "-qq", "--print-uris", name))
+
+    def concrete(self, meta: str) -> str:
+        """The package that a meta package stands for."""
+        fields = next(mirror.stanzas(self._run("apt-cache", "show", "--no-all-versions", meta)))
+        match = re.match(rf"({_VALID['name']}) \(= ", fields.get("Depends", ""))
+        if not match:
+            raise UserError(
+                f"package {meta} is no meta package of a kernel: it depends on '{fields.get('Depends', '')}'"
+            )
+        return match[1]
+
+    def _relative(self, line: str) -> str:
+        """The path below its archive that a line of `--print-uris` names."""
+        address = unquote(line.split("'")[1])
+        for base in self.archives.values():
+            if address.startswith(f"{unquote(base)}/pool/"):
+                return address.removeprefix(f"{unquote(base)}/")
+        raise UserError(f"apt names {address}, which is of none of {', '.join(self.archives.values())}")
+
+
+def _proxies() -> dict[str, str]:
+    """This computer's proxies for apt."""
+    dump = subprocess.run(
+        ["apt-config", "dump", "--format", "%f %v%n", "Acquire"], capture_output=True, text=True, check=True
+    ).stdout
+    pairs = (line.partition(" ") for line in dump.splitlines())
+    return {key: json.loads(f'"{value}"') for key, _, value in pairs if "::proxy" in key.lower() and value}
