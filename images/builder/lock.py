@@ -1,4 +1,4 @@
-"""Locks: exactly which Debian packages an image is made of, resolved by apt and verified by the archive's signatures."""
+"""Locks: exactly which Debian packages an image is made of, resolved by apt, signatures verified."""
 
 from __future__ import annotations
 
@@ -62,11 +62,6 @@ class Package:
     sha256: str
     path: str
     """Below the archive's base: `pool/main/…`."""
-
-    @property
-    def file(self) -> Path:
-        """Where the pool keeps it."""
-        return paths.POOL / f"{self.sha256}.deb"
 
     def __str__(self) -> str:
         return f"{self.name} {self.version} ({self.architecture})"
@@ -169,8 +164,8 @@ def parse_lock(text: str, name: str, shown: str) -> Lock:
                     raise ValueError(f"'{line}' is no architecture, suite or package")
         except ValueError as error:
             raise UserError(f"{shown}:{number}: {error}; mend the line or run `make lock`") from None
-    for what, value in {"architecture": architecture, "suite": suites, "package": packages}.items():
-        if not value:
+    for what, present in (("architecture", architecture), ("suite", suites), ("package", packages)):
+        if not present:
             raise UserError(f"{shown}: has no {what} line; restore it from git or run `make lock`")
     return Lock(name, architecture, tuple(sorted(suites)), tuple(sorted(packages.values())))
 
@@ -225,8 +220,8 @@ def wishes(name: str) -> list[Wish]:
 def update_locks(names: Iterable[str] = NAMES, mirrors: Mirrors | None = None, without: Collection[str] = ()) -> str:
     """Resolve the package lists against the mirrors, write the locks and say what changed, a line each.
 
-    `without` names suites to leave out, for a mirror whose copy of one is broken: what a signature does not cover is never
-    used, so the choice is between fewer packages and none. The lock says which suites it was made from.
+    `without` names suites to leave out, for a mirror whose copy of one is broken: what a signature does not cover is
+    never used, so the choice is between fewer packages and none. The lock says which suites it was made from.
     """
     mirrors = mirrors or mirror.resolve()
     changes = []
