@@ -86,7 +86,7 @@ def repository(lock: Lock, directory: Path) -> None:
     for package, control in zip(lock.packages, controls, strict=True):
         _link(file(package), directory / package.path)
         stanzas.append(_stanza(package, control))
-    content = "\n".join(stanzas).encode()
+    content = "".join(stanzas).encode()
     files = {"Packages": content, "Packages.gz": gzip.compress(content, mtime=0)}
     for name, data in files.items():
         (index / name).write_bytes(data)
@@ -258,11 +258,14 @@ def _control(package: Package) -> str:
 
 
 def _stanza(package: Package, control: str) -> str:
-    """Its stanza in the repository's index. The archive's word on what is required stands above the package's own."""
+    """Its stanza in the repository's index. The archive's word on what is required stands above the package's own.
+
+    debootstrap misses a stanza that no empty line ends.
+    """
     kept = re.sub(r"^Priority: .*\n", "", control, flags=re.MULTILINE)
     return (
         f"{kept.rstrip()}\nPriority: {'required' if package.role == 'required' else 'optional'}\n"
-        f"Filename: {package.path}\nSize: {package.size}\nSHA256: {package.sha256}\n"
+        f"Filename: {package.path}\nSize: {package.size}\nSHA256: {package.sha256}\n\n"
     )
 
 
