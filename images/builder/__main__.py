@@ -1,0 +1,96 @@
+"""Command line of the builder; `make help` lists the targets that call it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from images.builder.errors import UserError
+
+
+def _image(arguments: argparse.Namespace) -> None:
+    from images.builder import build, inventory
+
+    fleet = inventory.load_fleet()
+    robots = list(fleet.robots.values()) if arguments.all else [inventory.robot(fleet, arguments.robot)]
+    build.build(fleet, robots)
+
+
+def _flash(arguments: argparse.Namespace) -> None:
+    from images.builder import build, flash, inventory
+
+    robot = inventory.robot(inventory.load_fleet(), arguments.robot)
+    flash.flash(
+        build.image_of(robot), device=arguments.device, file=arguments.file, force=arguments.force, yes=arguments.yes,
+        robot=robot.name,
+    )  # fmt: skip
+
+
+def _boot(arguments: argparse.Namespace) -> None:
+    from images.builder import boot, build, inventory
+
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    boot.boot(robot, fleet.boards[robot.board], fleet.network, build.image_of(robot))
+
+
+def _ssh(arguments: argparse.Namespace) -> None:
+    from images.builder import boot, inventory
+
+    boot.ssh(inventory.robot(inventory.load_fleet(), arguments.robot))
+
+
+def _lock(_: argparse.Namespace) -> None:
+    from images.builder import lock
+
+    print(lock.update_locks())
+
+
+def _check_fleet(_: argparse.Namespace) -> None:
+    from images.builder import inventory
+
+    print(inventory.summary(inventory.load_fleet()))
+
+
+_COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
+    "image": (_image, "make card images"),
+    "flash": (_flash, "write a card and read it back"),
+    "boot": (_boot, "boot an image in QEMU"),
+    "ssh": (_ssh, "shell on a robot"),
+    "lock": (_lock, "resolve the package lists"),
+    "check-fleet": (_check_fleet, "validate the inventory"),
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m images.builder", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
+    for name in ("image", "flash", "boot", "ssh"):
+        made[name].add_argument("--robot", type=int, help="number in the inventory")
+    made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
+    target = made["flash"].add_mutually_exclusive_group(required=True)
+    target.add_argument("--device", type=Path, help="the card: /dev/sdX")
+    target.add_argument("--file", type=Path, help="a file instead of a card")
+    made["flash"].add_argument("--force", help="the word that an earlier refusal named")
+    made["flash"].add_argument("--yes", action="store_true", help="do not ask")
+    return parser
+
+
+def main() -> int:
+    arguments = _parser().parse_args()
+    try:
+        _COMMANDS[arguments.command][0](arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("error: interrupted; the last good outputs are untouched", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

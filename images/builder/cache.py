@@ -1,0 +1,69 @@
+"""Results of build steps, kept under the hash of everything that went into them.
+
+A result is a directory. It is made beside its place and renamed when complete, so that an interrupted build leaves
+nothing that could be taken for a result; what it left is removed by the next build.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from images.builder import paths
+
+
+def digest(*parts: str | bytes | Path) -> str:
+    """SHA-256 over texts, and over files and directory trees with their names and executable bits."""
+    total = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            for path in sorted(part.rglob("*")) if part.is_dir() else [part]:
+                if "__pycache__" in path.parts or path.is_dir():
+                    continue
+                name = str(path.relative_to(part.parent))
+                if path.is_symlink():
+                    content, kind = os.readlink(path).encode(), "link"
+                else:
+                    content, kind = path.read_bytes(), "x" if os.access(path, os.X_OK) else "-"
+                total.update(f"{kind} {len(name)} {name} {len(content)}\n".encode() + content)
+        else:
+            data = part.encode() if isinstance(part, str) else part
+            total.update(f"text {len(data)}\n".encode() + data)
+    return total.hexdigest()
+
+
+def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
+    """The directory that `make` fills, made once per `kind` and `key`."""
+    final = paths.CACHE / f"{kind}-{key[:16]}"
+    if not final.exists():
+        beside = final.with_name(final.name + ".part")
+        discard(beside)
+        beside.mkdir(parents=True)
+        try:
+            make(beside)
+            beside.rename(final)
+        finally:
+            discard(beside)
+    return final
+
+
+def discard(directory: Path) -> None:
+    """Remove a directory tree, if it is there, read-only directories included."""
+    if directory.exists():
+        for parent, _, _ in os.walk(directory):
+            Path(parent).chmod(0o755)
+        shutil.rmtree(directory)
+
+
+@contextmanager
+def exclusive() -> Iterator[None]:
+    """One build at a time in a build directory: a second one waits for the first."""
+    paths.CACHE.mkdir(parents=True, exist_ok=True)
+    with (paths.CACHE / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,125 @@
+"""What makes a card robot 3: the templates of rootfs_overlay/ rendered for it, and its keys.
+
+Keys are made once, when first needed, and kept in `paths.KEYS`: an SSH host key per robot, pinned everywhere, and the
+operator's key, which every robot admits.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import subprocess
+from pathlib import Path, PurePosixPath
+
+import jinja2
+
+from images.builder import paths
+from images.builder.errors import UserError
+from images.builder.filesystem import Node
+from images.builder.fleet import Fleet, Host, Robot
+
+_PRIVATE = {"ssh_host_ed25519_key.j2": 0o600}
+"""Modes of templates whose result is not for everyone."""
+
+
+def _key(name: str, comment: str) -> Path:
+    """The private key `name`, made if there is none."""
+    path = paths.KEYS / name
+    if not path.exists():
+        paths.KEYS.mkdir(parents=True, exist_ok=True, mode=0o700)
+        beside = path.with_name(f".{name}.new")
+        beside.unlink(missing_ok=True)
+        argv = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", comment, "-f", str(beside)]
+        try:
+            subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+        except subprocess.CalledProcessError as error:
+            raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
+        beside.with_name(beside.name + ".pub").rename(path.with_name(name + ".pub"))
+        beside.rename(path)
+    return path
+
+
+def _public(private: Path) -> str:
+    return " ".join(private.with_name(private.name + ".pub").read_text().split()[:2])
+
+
+def host_keys(fleet: Fleet) -> dict[str, str]:
+    """Public host key of every robot by name; makes what is missing, and the `known_hosts` that pins them."""
+    robots = sorted(fleet.robots.values(), key=lambda robot: robot.number)
+    keys = {robot.name: _public(_key(f"{robot.name}_ed25519", robot.name)) for robot in robots}
+    pinned = "".join(f"{robot.name},{robot.address} {keys[robot.name]}\n" for robot in robots)
+    known = paths.KEYS / "known_hosts"
+    if not known.exists() or known.read_text() != pinned:
+        beside = known.with_name(f".known_hosts.{os.getpid()}")
+        beside.write_text(pinned)
+        beside.rename(known)
+    return keys
+
+
+def hosts(fleet: Fleet) -> list[Host]:
+    """Everyone with an address, in order of address."""
+    return sorted([*fleet.robots.values(), *fleet.stations], key=lambda host: host.address)
+
+
+def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
+    """What the templates may use."""
+    keys = host_keys(fleet)
+    board = fleet.boards[robot.board]
+    first = 7400 + 250 * fleet.network.dds_domain
+    return {
+        "fleet": fleet,
+        "network": fleet.network,
+        "robot": robot,
+        "board": board,
+        "hosts": hosts(fleet),
+        "interface": board.network_interface if fleet.network.link == "ethernet" else "wlan0",
+        # DDSI-RTPS 2.1, 9.6.1: ports of a domain, up to the participant index that discovery asks for.
+        "dds_ports": f"{first}-{first + 249}",
+        "host_keys": keys,
+        "host_public_key": keys[robot.name],
+        "host_private_key": (paths.KEYS / f"{robot.name}_ed25519").read_text(),
+        "operator_key": _public(_key("operator_ed25519", "operator")),
+        # Stable, and not to be guessed back to anything (machine-id(5)).
+        "machine_id": hashlib.sha256(f"machine-id {keys[robot.name]}".encode()).hexdigest()[:32],
+    }
+
+
+@functools.cache
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(paths.OVERLAY),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+
+
+def render(fleet: Fleet, robot: Robot) -> dict[PurePosixPath, tuple[bytes, int]]:
+    """The robot's files by path on the robot: content and mode. An empty result means no file."""
+    values = variables(fleet, robot)
+    files = {}
+    for template in sorted(paths.OVERLAY.rglob("*.j2")):
+        name = template.relative_to(paths.OVERLAY)
+        try:
+            content = _environment().get_template(str(name)).render(values).encode()
+        except jinja2.TemplateError as error:
+            raise UserError(f"{paths.shown(template)}: {error}") from error
+        if content.strip():
+            files[PurePosixPath("/") / name.with_suffix("")] = (content, _PRIVATE.get(template.name, 0o644))
+    return files
+
+
+def nodes(fleet: Fleet, robot: Robot) -> list[Node]:
+    """The data partition: the layers above the root, with the robot's files in the one above /etc."""
+    files = render(fleet, robot)
+    tops = ["etc", "var", "home", ".work", ".work/etc", ".work/var", ".work/home"]
+    directories = {PurePosixPath("/", top) for top in tops}
+    for path in files:
+        if path.parts[1] != "etc":
+            raise UserError(f"rootfs_overlay{path}.j2: templates lie below etc/: the rest of the root is common to all robots")
+        directories |= {parent for parent in path.parents if parent != PurePosixPath("/")}
+    made = [Node(path) for path in directories] + [Node(path, content, mode) for path, (content, mode) in files.items()]
+    return sorted(made, key=lambda node: node.path.parts)

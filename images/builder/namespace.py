@@ -1,0 +1,73 @@
+"""Run a build stage as root of a world of its own, without being root.
+
+The stage gets its own mount, process and (for ordinary users) user namespace. Whatever it mounts and starts ends with
+it: when the builder dies, however it dies, the kernel ends the stage and takes its mounts away.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from images.builder import paths, progress
+from images.builder.errors import UserError
+
+
+def _refusal(stderr: str) -> UserError:
+    """What a host that forbids namespaces means for its user."""
+    reasons = [
+        (Path("/proc/sys/kernel/unprivileged_userns_clone"), "0", "sudo sysctl kernel.unprivileged_userns_clone=1"),
+        (Path("/proc/sys/user/max_user_namespaces"), "0", "sudo sysctl user.max_user_namespaces=10000"),
+        (
+            Path("/proc/sys/kernel/apparmor_restrict_unprivileged_userns"),
+            "1",
+            "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0",
+        ),
+    ]
+    for setting, forbidding, remedy in reasons:
+        if os.geteuid() != 0 and setting.exists() and setting.read_text().strip() == forbidding:
+            return UserError(
+                f"{setting}: {forbidding}: this computer forbids user namespaces, which building without root needs; "
+                f"allow them with `{remedy}`, or build as root with `sudo make image …`"
+            )
+    if os.geteuid() != 0 and ("subuid" in stderr or "newuidmap" in stderr or "uid_map" in stderr):
+        return UserError(
+            f"/etc/subuid: no range for {os.environ.get('USER', os.getuid())}: building without root maps 65536 users; "
+            "add one with `sudo usermod --add-subuids 100000-165535 --add-subgids 100000-165535 $USER`, "
+            "or build as root with `sudo make image …`"
+        )
+    return UserError(f"this computer refuses a mount namespace: {stderr.strip()}; build as root with `sudo make image …`")
+
+
+def prefix() -> list[str]:
+    """The command that puts what follows it into namespaces; the same for root and for ordinary users but the mapping."""
+    mapping = [] if os.geteuid() == 0 else ["--map-auto", "--map-root-user"]
+    # The stage must not outlive the builder, even one that was killed.
+    return ["setpriv", "--pdeathsig", "KILL", "unshare", *mapping, "--mount", "--pid", "--fork", "--kill-child", "--"]
+
+
+def check() -> None:
+    """Refuse early, with the remedy, where the host does not allow namespaces."""
+    probe = subprocess.run([*prefix(), "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True, text=True)
+    if probe.returncode != 0:
+        raise _refusal(probe.stderr)
+
+
+def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
+    """Run `python -m module arguments` in namespaces; its output goes to `log`, whose end is shown on failure."""
+    argv = [*prefix(), sys.executable, "-m", module, *arguments]
+    progress.command(argv)
+    environment = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LC_ALL": "C.UTF-8", "TZ": "UTC", "PYTHONPATH": str(paths.PROJECT)}
+    environment |= {name: os.environ[name] for name in ("BUILD", "V", "LD_PRELOAD", "FAKETIME") if name in os.environ}
+    with log.open("wb") as output:
+        process = subprocess.Popen(argv, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+        try:
+            status = process.wait()
+        finally:
+            process.kill()
+    if status != 0:
+        tail = "\n".join(log.read_text(errors="replace").splitlines()[-30:])
+        raise UserError(f"{module} failed (status {status}); the end of {paths.shown(log)}:\n{tail}")

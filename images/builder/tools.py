@@ -1,0 +1,66 @@
+"""The build tools (debootstrap, mksquashfs, mke2fs, GRUB …) at locked versions, whatever the host has.
+
+They are unpacked, not installed, into a tree of their own. A tool that needs nothing but files of the caller runs
+straight from there through the tree's own dynamic loader; the root file system is made in a chroot of the tree.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+from images.builder import cache, pool, progress
+from images.builder.errors import UserError
+from images.builder.lock import Lock
+
+_MERGED = ("bin", "sbin", "lib", "lib32", "lib64")
+_MOUNT_POINTS = ("dev", "proc", "sys", "tmp", "repository", "target", "out", "run")
+
+
+def tree(lock: Lock) -> Path:
+    """The tools of `lock`, unpacked once."""
+
+    def unpack(directory: Path) -> None:
+        with progress.step(f"unpack {len(lock.packages)} build tools") as step:
+            for name in _MERGED:
+                (directory / "usr" / name).mkdir(parents=True)
+                (directory / name).symlink_to(f"usr/{name}")
+            for done, package in enumerate(lock.packages):
+                archive = subprocess.Popen(["dpkg-deb", "--fsys-tarfile", pool.file(package)], stdout=subprocess.PIPE)
+                extract = ["tar", "-x", "--keep-directory-symlink", "--no-same-owner", "-C", str(directory)]
+                unpacked = subprocess.run([*extract, "--exclude=./usr/share/doc", "--exclude=./usr/share/man"], stdin=archive.stdout)
+                if archive.wait() != 0 or unpacked.returncode != 0:
+                    raise UserError(f"cannot unpack {package.name} {package.version} ({pool.file(package)})")
+                step.at(done + 1, len(lock.packages), "packages")
+            for name in _MOUNT_POINTS:
+                (directory / name).mkdir(exist_ok=True)
+            # What the maintainer scripts would have set up.
+            (directory / "usr/bin/awk").symlink_to("mawk")
+
+    return cache.result("tools", cache.digest(lock.digest, Path(__file__)), unpack)
+
+
+class Tools:
+    """Runs the unpacked tools on files of the caller, with time stopped at `epoch`."""
+
+    def __init__(self, directory: Path, epoch: int) -> None:
+        self.directory = directory
+        self._environment = {
+            "LC_ALL": "C.UTF-8",
+            "TZ": "UTC",
+            "SOURCE_DATE_EPOCH": str(epoch),
+            "E2FSPROGS_FAKE_TIME": str(epoch),
+            "MKE2FS_CONFIG": os.devnull,
+        }
+
+    def run(self, program: str, *arguments: str | Path, stdin: str | None = None) -> str:
+        """Run a tool by its path in the tree (`usr/sbin/mke2fs`); its standard output."""
+        loader = self.directory / "lib64/ld-linux-x86-64.so.2"
+        library = self.directory / "usr/lib/x86_64-linux-gnu"
+        argv = [str(loader), "--library-path", str(library), str(self.directory / program), *map(str, arguments)]
+        progress.command([program, *map(str, arguments)])
+        done = subprocess.run(argv, env=self._environment, input=stdin, capture_output=True, text=True)
+        if done.returncode != 0:
+            raise UserError(f"{program} failed (status {done.returncode}): {done.stderr.strip() or done.stdout.strip()}")
+        return done.stdout
