@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[2]
-BUILD = Path(os.environ.get("BUILD", PROJECT / "build")).resolve()
+BUILD = Path(os.environ.get("BUILD") or PROJECT / "build").resolve()
 """All outputs. Removing it loses nothing that cannot be made again."""
-KEYS = Path(os.environ.get("KEYS", PROJECT / "ansible" / "keys")).resolve()
+KEYS = Path(os.environ.get("KEYS") or PROJECT / "ansible" / "keys").resolve()
 """Private keys: made once, never in git, never removed by `make clean`."""
 
 POOL = BUILD / "pool"
