@@ -1,14 +1,86 @@
 """The fleet's description as typed values: what `ansible/inventory/` says, merged by Ansible's own rules.
 
-Units: bytes, bits per second, seconds. Addresses are IPv4.
+Units: bytes, bits per second, seconds. Addresses are IPv4. What a single value may be is checked here; what values
+must have to do with each other (no two robots with one number, …) is checked in `inventory.py`.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from ipaddress import IPv4Address, IPv4Network
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Strict
+from pydantic_core import PydanticCustomError
+
+BAUDS = (300, 600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
+"""Rates of termios(3) that serial devices use. A plain 16550A ends at 115200."""
+
+CHANNELS_MHZ = (
+    *range(2412, 2473, 5),  # 802.11b/g channels 1–13
+    2484,  # 802.11b channel 14, Japan
+    *range(5180, 5321, 20),  # 802.11a channels 36–64
+    *range(5500, 5721, 20),  # 100–144
+    *range(5745, 5826, 20),  # 149–165
+)
+"""Channel centres of IEEE 802.11. Which of them may be used without radar detection is the country's to say."""
+
+
+def _checked(right: Callable[[Any], object], message: str, remedy: str) -> AfterValidator:
+    """A check whose failure says what is wrong and what would be right."""
+
+    def check(value: Any) -> Any:
+        if not right(value):
+            raise PydanticCustomError("flotilla", "{message}", {"message": message, "remedy": remedy})
+        return value
+
+    return AfterValidator(check)
+
+
+def _matching(pattern: str, message: str, remedy: str) -> AfterValidator:
+    return _checked(re.compile(pattern).fullmatch, message, remedy)
+
+
+def _between(low: int, high: int, why: str = "") -> AfterValidator:
+    return _checked(lambda value: low <= value <= high, "is out of range", f"{low} to {high}{why and f': {why}'}")
+
+
+def _is_udp_range(text: str) -> bool:
+    ports = [int(port) for port in text.split("-")] if re.fullmatch(r"\d{1,5}(-\d{1,5})?", text) else []
+    return bool(ports) and 1 <= ports[0] <= ports[-1] <= 65535
+
+
+_Int = Annotated[int, Strict()]
+"""A YAML integer; neither `true` nor `"5"` passes for one."""
+Baud = Annotated[_Int, _checked(BAUDS.__contains__, "is not a standard rate", f"one of {', '.join(map(str, BAUDS))}")]
+Tty = Annotated[
+    str, _matching(r"tty[A-Z]+[0-9]+", "is not a serial port's kernel name", "such as ttyS4, as in /dev without /dev/")
+]
+Interface = Annotated[
+    str,
+    _matching(
+        r"[a-z][a-z0-9]{0,14}", "is not a network interface's name", "such as eth0 or wlan0, at most 15 characters"
+    ),
+]
+Label = Annotated[
+    str,
+    _matching(
+        r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?",
+        "is not a valid host name (RFC 1123)",
+        "small letters, digits and inner hyphens, at most 63 characters, such as robot5",
+    ),
+]
+DeviceName = Annotated[
+    str,
+    _matching(
+        r"[a-z][a-z0-9_]{0,31}",
+        "is not a valid device name",
+        "a small letter, then small letters, digits or underscores, such as gyro_2: it becomes /dev/robot/NAME",
+    ),
+]
+Word = Annotated[str, _matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
+Module = Annotated[str, _matching(r"[A-Za-z0-9_]+", "is not a kernel module's name", "such as ata_piix, without .ko")]
 
 
 class _Model(BaseModel):
@@ -18,14 +90,22 @@ class _Model(BaseModel):
 class IsaResources(_Model):
     """Where a serial port sits that no bus announces (PC/104 boards with jumpers)."""
 
-    io: int
-    irq: int
+    io: Annotated[
+        _Int,
+        _checked(
+            lambda io: 0x100 <= io <= 0xFFF8 and io % 8 == 0,
+            "is not a serial port's base address",
+            "0x100 to 0xFFF8 in steps of 8, such as 0x3E8",
+        ),
+    ]
+    """Base of the UART's eight I/O ports."""
+    irq: Annotated[_Int, _between(3, 15, "the ISA bus has no others")]
 
 
 class Port(_Model):
     """One serial connector of a board."""
 
-    tty: str
+    tty: Tty
     """Kernel name, such as `ttyS4`."""
     isa: IsaResources | None = None
     """Set for ports that must be declared to the kernel."""
@@ -34,22 +114,39 @@ class Port(_Model):
 class Console(_Model):
     """The serial port that GRUB, the kernel and the login prompt use."""
 
-    tty: str
-    baud: int
+    tty: Annotated[
+        str,
+        _matching(
+            r"ttyS[0-3]", "cannot be the console", "ttyS0 to ttyS3: GRUB reaches only the ports of the PC itself"
+        ),
+    ]
+    baud: Annotated[
+        _Int,
+        _checked(BAUDS[: BAUDS.index(115200) + 1].__contains__, "is not a console's rate", "such as 115200 or 38400"),
+    ]
 
 
 class Qemu(_Model):
     """The machine that stands in for the board."""
 
     system: Literal["i386", "x86_64"]
-    machine: str
-    cpu: str
-    memory_mib: int
+    """Which `qemu-system-…`."""
+    machine: Word
+    """`-machine`, with version, so that another QEMU shows the guest the same machine."""
+    cpu: Word
+    """`-cpu`."""
+    memory_mib: Annotated[_Int, _between(64, 65536)]
     disk: Literal["ide", "ahci", "virtio"]
-    network: str
+    """How the card is attached."""
+    network: Word
     """QEMU device model of the wired port."""
-    devices: list[str]
-    """Further `-device` arguments; serial ports of a card take chardevs `port0`, `port1`, … in order of the board's ports."""
+    devices: list[Word]
+    """Further `-device` arguments. Connectors take chardevs: `port0` is the board's first port, `port1` its second, …;
+    whoever starts QEMU provides a chardev for each port and attaches the console's by `-serial`."""
+
+
+def _by_tty(ports: dict[str, Port]) -> dict[str, Port]:
+    return dict(sorted(ports.items(), key=lambda item: (len(item[1].tty), item[1].tty)))
 
 
 class Board(_Model):
@@ -59,15 +156,18 @@ class Board(_Model):
     """Name of the group without `board_`."""
     description: str
     architecture: Literal["i386", "amd64"]
+    """Debian's name of the processor architecture."""
     kernel: Literal["debian", "lean"]
-    kernel_arguments: list[str]
+    """Debian's own real-time kernel, or the one built from `kernel/`."""
+    kernel_arguments: list[Word]
     """Kernel command line beyond what every card has."""
     console: Console
-    ports: dict[str, Port]
-    """Serial connectors by the name printed on the board."""
-    network_interface: str
-    """Kernel name of the port that the robot's address belongs to."""
-    disk_modules: list[str]
+    ports: Annotated[dict[str, Port], AfterValidator(_by_tty)]
+    """Serial connectors by the name printed on the board, in order of their ttys (Ansible keeps no order)."""
+    network_interface: Interface
+    """Kernel name of the wired port; the robot's address belongs to it when the network's link is `ethernet`.
+    Images boot with `net.ifnames=0`, so the first one is `eth0` on every board."""
+    disk_modules: list[Module]
     """Kernel modules needed to reach the card; they make the initramfs."""
     qemu: Qemu
 
@@ -75,9 +175,36 @@ class Board(_Model):
 class Ibss(_Model):
     """An 802.11 ad hoc cell. The BSSID is fixed, or cells split."""
 
-    ssid: str
-    frequency_mhz: int
-    bssid: str
+    ssid: Annotated[
+        str,
+        _checked(
+            lambda ssid: 1 <= len(ssid.encode()) <= 32, "is not a valid network name", "1 to 32 bytes (IEEE 802.11)"
+        ),
+    ]
+    frequency_mhz: Annotated[
+        _Int,
+        _checked(
+            CHANNELS_MHZ.__contains__,
+            "is not the centre of an 802.11 channel",
+            "2412, 2417, … 2472 MHz (channels 1 to 13), or a 5 GHz channel such as 5180",
+        ),
+    ]
+    bssid: Annotated[
+        str,
+        _matching(
+            r"[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}",
+            "is not a BSSID",
+            "six pairs of hexadecimal digits in quotes, such as '02:ca:ff:ee:10:42'",
+        ),
+        _checked(
+            lambda bssid: int(bssid[:2], 16) % 2 == 0 and bssid.strip("0:"),
+            "is a multicast or zero address",
+            "the second digit even, best 2 (locally administered), such as '02:ca:ff:ee:10:42'",
+        ),
+    ]
+    interface: Interface = "wlan0"
+    """Kernel name of the radio. The robot's address belongs to it when the network's link is `ibss`. It is here and
+    not with the board, because with `net.ifnames=0` the only radio of any board is `wlan0`."""
 
 
 class Network(_Model):
@@ -85,9 +212,19 @@ class Network(_Model):
 
     subnet: IPv4Network
     link: Literal["ethernet", "ibss"]
+    """`ethernet`: the wired port, maybe with a pocket radio behind it. `ibss`: an 802.11 adapter in ad hoc mode."""
     ibss: Ibss | None = None
-    dds_domain: int
-    udp_ports: list[str]
+    """Required when the link is `ibss`."""
+    dds_domain: Annotated[_Int, _between(0, 232, "beyond it the ports 7400 + 250 × domain … do not exist")]
+    udp_ports: list[
+        Annotated[
+            str,
+            BeforeValidator(lambda port: str(port) if type(port) is int else port),
+            _checked(
+                _is_udp_range, "is not a port or a range of ports", "such as 5000 or 5000-5099, within 1 to 65535"
+            ),
+        ]
+    ]
     """UDP ports or ranges (`5000-5099`) that robots accept from fleet addresses, DDS excepted."""
 
 
@@ -95,28 +232,37 @@ class Device(_Model):
     """Something plugged into a serial port. Its name becomes `/dev/robot/NAME`."""
 
     port: str
-    baud: int
+    """The connector's name in the board's `ports`."""
+    baud: Baud
 
 
 class Host(_Model):
     """A member of the fleet: a robot or the station."""
 
-    name: str
+    name: Label
     address: IPv4Address
 
 
 class Robot(Host):
-    number: int
+    number: Annotated[_Int, _between(1, 250)]
     board: str
-    devices: dict[str, Device] = {}
+    """Name of the board, a key of `Fleet.boards`."""
+    devices: dict[DeviceName, Device] = {}
 
 
 class Fleet(_Model):
     """The whole description, valid in itself."""
 
-    name: str
+    name: Label
     network: Network
     boards: dict[str, Board]
     robots: dict[int, Robot]
-    """By number."""
+    """By number, ascending."""
     stations: list[Host]
+
+    def interface(self, robot: Robot) -> str:
+        """Kernel name of the interface that the robot's address belongs to."""
+        ibss = self.network.ibss
+        if self.network.link == "ibss" and ibss:
+            return ibss.interface
+        return self.boards[robot.board].network_interface
