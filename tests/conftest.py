@@ -1,0 +1,126 @@
+"""Fixtures that all tests share: the fleet, its guests in QEMU, and a place for evidence.
+
+A guest runs the very image that `make flash` would write, and nothing enters it but through its connectors:
+
+    def test_root_is_read_only(guest: GuestFactory) -> None:
+        robot = guest(3)                                     # booted once per session, shared by all tests
+        assert "ro" in robot.shell.run(["findmnt", "-no", "OPTIONS", "/"]).stdout.split(",")
+
+    def test_survives_power_cut(fresh_guest: GuestFactory) -> None:
+        robot = fresh_guest(3)                               # this test's own; may be broken
+        robot.machine.cut()
+        robot.machine.on()
+        robot.wait_booted()
+
+Check as much as possible on a shared guest: each boot costs half a minute. Leave a shared guest as you found it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from images.builder import inventory, paths, qemu
+from images.builder.build import image_of
+from images.builder.fleet import Fleet, Robot
+from tests.lab.guest import Guest
+from tests.lab.ssh import Ssh
+
+pytest_plugins = ["tests.lab.artefacts"]
+
+BOOT_SECONDS = 300
+"""Until the login prompt. Some 30 s on an idle host; the limit only has to be finite, and generous to a busy one."""
+
+
+@dataclass(frozen=True)
+class RobotGuest:
+    """A robot of the fleet as a guest in QEMU."""
+
+    robot: Robot
+    machine: Guest
+    """Power, console, serial ports, cable, QMP."""
+    shell: Ssh
+    """Commands and files, as user `robot`."""
+
+    def wait_booted(self, timeout: float = BOOT_SECONDS) -> None:
+        """Wait for the login prompt of a boot that was started by `machine.on()`, `machine.reset()` or the guest."""
+        self.machine.console.expect(rf"{self.robot.name} login: ", timeout)
+        self.shell.connect()
+
+
+GuestFactory = Callable[..., RobotGuest]
+"""`guest(number)`: the robot's guest, booted, with SSH connected. `fresh_guest` also takes the arguments of `Guest`
+(`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of `qemu.Options`) and `boot=False` to power it on
+oneself."""
+
+
+@pytest.fixture(scope="session")
+def fleet() -> Fleet:
+    """The fleet that `ansible/inventory/` describes."""
+    return inventory.load_fleet()
+
+
+@pytest.fixture(scope="session")
+def guest(fleet: Fleet, session_artefacts: Path) -> Iterator[GuestFactory]:
+    """`guest(3)`: robot 3, booted when a test first asks and shared by all that ask later.
+
+    A boot that failed is not tried again: every test that needs it fails at once, with the first cause.
+    """
+    booted: dict[int, RobotGuest | BaseException] = {}
+    with ExitStack() as cleanup:
+
+        def shared(number: int) -> RobotGuest:
+            if number not in booted:
+                try:
+                    booted[number] = _boot(fleet, number, session_artefacts / f"robot{number}", cleanup)
+                except BaseException as error:
+                    booted[number] = error
+            found = booted[number]
+            if isinstance(found, BaseException):
+                raise found
+            return found
+
+        yield shared
+
+
+@pytest.fixture
+def fresh_guest(fleet: Fleet, artefacts: Path) -> Iterator[GuestFactory]:
+    """`fresh_guest(3)`: robot 3 with a card as flashed, for this test alone and to be broken by it.
+
+    With `boot=False` it comes switched off; then `machine.on()` and `wait_booted()` are the test's to call.
+    """
+    with ExitStack() as cleanup:
+        yield lambda number, **arguments: _boot(fleet, number, artefacts / f"robot{number}", cleanup, **arguments)
+
+
+def _boot(
+    fleet: Fleet,
+    number: int,
+    directory: Path,
+    cleanup: ExitStack,
+    *,
+    boot: bool = True,
+    qemu_options: dict[str, Any] | None = None,
+    **arguments: Any,
+) -> RobotGuest:
+    robot = inventory.robot(fleet, number)
+    image = image_of(robot)
+    if not image.exists():
+        pytest.fail(f"{paths.shown(image)} is missing; build it: make image ROBOT={number}", pytrace=False)
+    link = qemu.UserLink(
+        subnet=fleet.network.subnet,
+        guest=robot.address,
+        station=fleet.stations[0].address if fleet.stations else qemu.station_address(fleet.network, robot.address),
+    )
+    options = qemu.Options(**{"name": robot.name, "mac": qemu.robot_mac(number), "link": link, **(qemu_options or {})})
+    machine = cleanup.enter_context(Guest(fleet.boards[robot.board], image, directory, options, **arguments))
+    guest = RobotGuest(robot, machine, cleanup.enter_context(Ssh(robot, "127.0.0.1", machine.ssh_port)))
+    if boot:
+        machine.on()
+        guest.wait_booted()
+    return guest

@@ -1,0 +1,243 @@
+"""The QEMU command line, `make boot` and `make ssh`, without running QEMU or ssh."""
+
+from __future__ import annotations
+
+import json
+import os
+from ipaddress import IPv4Address, IPv4Network
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from images.builder import boot, paths, qemu
+from images.builder.errors import UserError
+from images.builder.fleet import Board, Network, Robot
+
+ROBOT = Robot(name="robot3", address=IPv4Address("10.42.0.3"), number=3, board="pc104")
+NETWORK = Network(subnet=IPv4Network("10.42.0.0/24"), link="ethernet", dds_domain=0, udp_ports=[])
+CARD = Path("/somewhere/card,1.qcow2")
+EMULATOR: dict[str, Any] = {
+    "system": "i386",
+    "machine": "pc-i440fx-7.2",
+    "cpu": "pentium3",
+    "memory_mib": 256,
+    "disk": "ide",
+    "network": "i82559er",
+    "devices": ["isa-serial,index=1,chardev=port1", "ib700"],
+}
+
+
+def board(console: str = "ttyS0", **emulator: Any) -> Board:
+    return Board.model_validate(
+        {
+            "name": "pc104",
+            "description": "a stack",
+            "architecture": "i386",
+            "kernel": "debian",
+            "kernel_arguments": [],
+            "console": {"tty": console, "baud": 115200},
+            "ports": {"COM1": {"tty": "ttyS0"}, "COM2": {"tty": "ttyS1"}, "COM5": {"tty": "ttyS4"}},
+            "network_interface": "eth0",
+            "disk_modules": ["ata_piix"],
+            "qemu": EMULATOR | emulator,
+        }
+    )
+
+
+@pytest.fixture(autouse=True)
+def qemu_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Programs that QEMU would bring; the command line needs only their paths."""
+    directory = tmp_path / "bin"
+    directory.mkdir()
+    for name in ("qemu-system-i386", "qemu-system-x86_64"):
+        (directory / name).write_text("#!/bin/false\n")
+        (directory / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(directory))
+    return directory
+
+
+@pytest.fixture
+def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A build directory and keys of the test's own."""
+    monkeypatch.setattr(boot, "RUN", tmp_path / "run")
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys of ours")
+    paths.KEYS.mkdir()
+    (paths.KEYS / "operator_ed25519").touch()
+    (paths.KEYS / "known_hosts").touch()
+    return tmp_path
+
+
+def values(argv: list[str], option: str) -> list[str]:
+    """Every value of an option, in order."""
+    return [value for name, value in pairwise(argv) if name == option]
+
+
+def command_line(of: Board, **options: Any) -> list[str]:
+    return qemu.command_line(of, CARD, qemu.Options(**options))
+
+
+def test_machine_is_the_boards_and_nothing_else() -> None:
+    argv = command_line(board())
+    assert argv[0].endswith("/qemu-system-i386")
+    assert "-nodefaults" in argv
+    assert values(argv, "-machine") == ["pc-i440fx-7.2"]
+    assert values(argv, "-cpu") == ["pentium3"]
+    assert values(argv, "-m") == ["256"]
+    assert values(argv, "-accel") == ["tcg"]
+    assert command_line(board(system="x86_64"))[0].endswith("/qemu-system-x86_64")
+
+
+@pytest.mark.parametrize(
+    ("disk", "machine", "devices"),
+    [
+        ("ide", "pc-i440fx-7.2", ["ide-hd,drive=card,bus=ide.0,unit=0,bootindex=0"]),
+        ("ahci", "pc-q35-7.2", ["ide-hd,drive=card,bus=ide.0,unit=0,bootindex=0"]),
+        ("ahci", "pc-i440fx-7.2", ["ahci,id=sata", "ide-hd,drive=card,bus=sata.0,bootindex=0"]),
+        ("virtio", "pc-i440fx-7.2", ["virtio-blk-pci,drive=card,bootindex=0"]),
+    ],
+)
+def test_card(disk: str, machine: str, devices: list[str]) -> None:
+    argv = command_line(board(disk=disk, machine=machine))
+    assert values(argv, "-device")[: len(devices)] == devices
+    (blockdev,) = map(json.loads, values(argv, "-blockdev"))
+    assert blockdev["file"]["filename"] == str(CARD)
+    assert blockdev["driver"] == "qcow2"
+
+
+def test_serial_ports_are_silent_unless_asked() -> None:
+    argv = command_line(board(), console="stdio", ports={"COM5": qemu.tcp_socket(4005)})
+    assert values(argv, "-serial") == ["chardev:console"]
+    assert values(argv, "-chardev") == [
+        "stdio,id=console",
+        "null,id=port1",
+        "socket,id=port2,host=127.0.0.1,port=4005,server=on,wait=off,nodelay=on",
+    ]
+    devices = values(argv, "-device")
+    assert devices.index("isa-serial,index=1,chardev=port1") < devices.index("ib700")
+    assert qemu.unix_socket(Path("/a,b")) == "socket,path=/a,,b,server=on,wait=off"
+
+
+def test_console_on_another_port() -> None:
+    argv = command_line(board(console="ttyS1"))
+    assert values(argv, "-serial") == ["none", "chardev:console"]
+    assert qemu.port_ids(board(console="ttyS1")) == {"COM1": "port0", "COM5": "port2"}
+
+
+@pytest.mark.parametrize("port", ["COM1", "COM77"])
+def test_port_that_is_the_console_or_missing(port: str) -> None:
+    with pytest.raises(ValueError, match=f"no port {port} besides the console"):
+        command_line(board(), ports={port: qemu.PTY})
+
+
+def test_user_network_knows_the_fleet_and_lets_nothing_out() -> None:
+    link = qemu.UserLink(NETWORK.subnet, ROBOT.address, IPv4Address("10.42.0.254"), 2203)
+    argv = command_line(board(), link=link, mac=qemu.robot_mac(3))
+    (netdev,) = values(argv, "-netdev")
+    assert netdev == (
+        "user,id=net,net=10.42.0.0/24,host=10.42.0.254,dns=10.42.0.253,dhcpstart=10.42.0.3,ipv6=off,restrict=on,"
+        "hostfwd=tcp:127.0.0.1:2203-10.42.0.3:22"
+    )
+    assert "i82559er,id=nic,mac=52:54:00:f1:00:03,romfile=,netdev=net" in values(argv, "-device")
+
+
+@pytest.mark.parametrize("last", [252, 253, 254])
+def test_user_network_avoids_the_guests_address(last: int) -> None:
+    guest = IPv4Address(f"10.42.0.{last}")
+    station = qemu.station_address(NETWORK, guest)
+    arguments = dict(
+        argument.partition("=")[::2]
+        for argument in qemu.user_netdev("net", NETWORK.subnet, station, {guest: 0}).split(",")
+    )
+    assert len({str(guest), arguments["host"], arguments["dns"]}) == 3
+
+
+def test_segment_stays_on_the_loopback_interface() -> None:
+    argv = command_line(board(), link=qemu.SegmentLink(4711), capture=Path("/wire.pcap"))
+    assert values(argv, "-netdev") == ["socket,id=net,mcast=230.0.0.77:4711,localaddr=127.0.0.1"]
+    assert values(argv, "-object") == ["filter-dump,id=capture,netdev=net,file=/wire.pcap"]
+
+
+def test_without_link_the_network_card_is_still_there() -> None:
+    argv = command_line(board())
+    assert values(argv, "-netdev") == []
+    assert any(device.startswith("i82559er,") for device in values(argv, "-device"))
+
+
+def test_macs_differ() -> None:
+    assert len({qemu.robot_mac(number) for number in range(1, 251)}) == 250
+
+
+def test_switches() -> None:
+    plain = command_line(board())
+    assert "-S" not in plain
+    assert "-no-reboot" not in plain
+    assert values(plain, "-mon") == []
+    assert values(plain, "-action") == ["watchdog=reset"]
+    argv = command_line(board(), paused=True, reboot=False, watchdog="pause", qmp="socket,fd=5", extra=("-d", "int"))
+    assert "-S" in argv
+    assert "-no-reboot" in argv
+    assert values(argv, "-action") == ["watchdog=pause"]
+    assert "socket,id=qmp,fd=5" in values(argv, "-chardev")
+    assert values(argv, "-mon") == ["chardev=qmp,mode=control"]
+    assert argv[-2:] == ["-d", "int"]
+
+
+def test_virtual_time() -> None:
+    argv = command_line(board(), virtual_time=True)
+    assert values(argv, "-icount") == ["shift=3,sleep=off"]
+    assert values(argv, "-accel") == ["tcg,thread=single"]
+    assert any("clock=vm" in value for value in values(argv, "-rtc"))
+
+
+def test_missing_qemu(qemu_installed: Path) -> None:
+    (qemu_installed / "qemu-system-i386").unlink()
+    with pytest.raises(UserError, match=r"qemu-system-i386 is missing.*apt-get install.*qemu-system-x86 qemu-utils"):
+        command_line(board())
+
+
+def test_boot_without_image(build: Path) -> None:
+    with pytest.raises(UserError, match=r"robot3.img is missing; build it: make image ROBOT=3"):
+        boot.boot(ROBOT, board(), NETWORK, build / "robot3.img")
+
+
+def test_port_is_known_only_while_make_boot_runs(build: Path) -> None:
+    assert boot.forwarded_port(ROBOT) is None
+    with boot._announced(ROBOT) as port:
+        assert boot.forwarded_port(ROBOT) == port
+        with pytest.raises(UserError, match="runs already"), boot._announced(ROBOT):
+            pass
+        assert boot.forwarded_port(ROBOT) == port
+    assert boot.forwarded_port(ROBOT) is None
+
+
+def ssh_command(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What `make ssh` would become."""
+    became: list[str] = []
+    monkeypatch.setattr(os, "execvp", lambda _, argv: became.extend(argv))
+    boot.ssh(ROBOT, ["uptime"])
+    return became
+
+
+def test_ssh_pins_the_host_key(build: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    argv = ssh_command(monkeypatch)
+    assert argv[-2:] == ["10.42.0.3", "uptime"]
+    assert {
+        'User="robot"',
+        'StrictHostKeyChecking="yes"',
+        'HostKeyAlias="robot3"',
+        f'UserKnownHostsFile="{build}/keys of ours/known_hosts"',
+        f'IdentityFile="{build}/keys of ours/operator_ed25519"',
+    } <= set(values(argv, "-o"))
+
+
+def test_ssh_prefers_the_guest(build: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with boot._announced(ROBOT) as port:
+        assert ssh_command(monkeypatch)[-4:] == ["-p", str(port), "127.0.0.1", "uptime"]
+
+
+def test_ssh_without_keys(build: Path) -> None:
+    (paths.KEYS / "known_hosts").unlink()
+    with pytest.raises(UserError, match="known_hosts is missing"):
+        boot.ssh(ROBOT)
