@@ -210,7 +210,12 @@ class Ibss(_Model):
 class Network(_Model):
     """The one network of the fleet."""
 
-    subnet: IPv4Network
+    subnet: Annotated[
+        IPv4Network,
+        _checked(
+            lambda net: 8 <= net.prefixlen <= 30, "has no room or no end", "address/length, length 8 to 30, best 24"
+        ),
+    ]
     link: Literal["ethernet", "ibss"]
     """`ethernet`: the wired port, maybe with a pocket radio behind it. `ibss`: an 802.11 adapter in ad hoc mode."""
     ibss: Ibss | None = None

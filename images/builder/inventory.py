@@ -43,6 +43,8 @@ _HOMES = {"fleet_name": "all", "network": "all", "board": "board_*"}
 _VARIABLES = {"number", "address", "devices", *_HOMES}
 """The variables read here. Any others are Ansible's and its roles'."""
 
+_SYNTAX = "(syntax)"
+
 
 def load_fleet(directory: Path = paths.INVENTORY) -> Fleet:
     """The fleet that the inventory in `directory` describes, or ProblemsError with all that is wrong in it."""
@@ -161,6 +163,8 @@ class Sources:
         for path in sorted(directory.rglob("*")):
             if path.suffix in (".yml", ".yaml", ".json") and path.is_file():
                 self._read(path)
+        if any(problem.key == _SYNTAX for problem in self.problems):  # Ansible could not read it either
+            raise ProblemsError(self.problems)
         for (kind, name), entries in self._entries.items():
             for entry in entries:
                 self._check_names(kind, name, entry)
@@ -200,7 +204,7 @@ class Sources:
             value = text.splitlines()[mark.line].strip() if mark and mark.line < len(text.splitlines()) else "(text)"
             message = f"is not YAML: {getattr(error, 'problem', None) or error}"
             remedy = "look at indentation (blanks, no tabs), colons and quotes here and in the lines above"
-            self.problems.append(Problem(paths.shown(path) + line, "(syntax)", value, message, remedy))
+            self.problems.append(Problem(paths.shown(path) + line, _SYNTAX, value, message, remedy))
             return
         if root is None:
             return
@@ -417,13 +421,15 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
             member |= {key: variables[key] for key in ("number", "devices") if key in variables}
             member["board"] = own[0].removeprefix("board_") if own else ""
         raw[kind][host] = member
-        for name in (group.removeprefix("board_") for group in own):
-            board = variables.get("board")
-            raw["boards"][name] = board | {"name": name} if isinstance(board, dict) else board
-            if isinstance(board, dict) and "name" in board:
+        if len(own) == 1:  # of several boards Ansible has merged one
+            raw["boards"].setdefault(member["board"], variables.get("board"))
+    for name, board in raw["boards"].items():
+        if board is None:
+            findings.append((("boards", name), "is not described", "copy another board's file to this one"))
+        elif isinstance(board, dict):
+            if "name" in board:
                 findings.append((("boards", name, "name"), "is not known", f"remove it: the group says it, {name}"))
-    for name in [name for name, board in raw["boards"].items() if board is None]:
-        findings.append((("boards", name), "is not described", "copy another board's file to this one"))
+            raw["boards"][name] = board | {"name": name}
     if not raw["robots"]:
         findings.append((("robots",), "there are no robots", "add one to the group robots in robots.yml"))
     return raw, findings
