@@ -245,17 +245,16 @@ def update_locks(names: Iterable[str] = NAMES, mirrors: Mirrors | None = None, w
 
 def difference(old: Iterable[Package], new: Iterable[Package]) -> list[str]:
     """What was added, removed or changed, a line each."""
-    before = {package.name: package.version for package in old}
-    after = {package.name: package.version for package in new}
-    return [
-        f"- {name} {before[name]}"
-        if name not in after
-        else f"+ {name} {after[name]}"
-        if name not in before
-        else f"  {name} {before[name]} -> {after[name]}"
-        for name in sorted(before.keys() | after.keys())
-        if before.get(name) != after.get(name)
-    ]
+    before = {package.name: package for package in old}
+    after = {package.name: package for package in new}
+    added = {name: f"+ {name} {after[name].version}" for name in after.keys() - before.keys()}
+    removed = {name: f"- {name} {before[name].version}" for name in before.keys() - after.keys()}
+    changed = {
+        name: f"~ {name} {before[name].version} -> {after[name].version}"
+        for name in before.keys() & after.keys()
+        if before[name] != after[name]
+    }
+    return [line for _, line in sorted((added | removed | changed).items())]
 
 
 def resolve(name: str, mirrors: Mirrors, without: Collection[str] = ()) -> Lock:
@@ -274,12 +273,12 @@ def resolve(name: str, mirrors: Mirrors, without: Collection[str] = ()) -> Lock:
     if recipe.system:
         userland |= required | {"apt"}  # debootstrap's smallest variant holds these
     selected: dict[str, Role] = {
-        path: "required" if index[path][1]["Package"] in required else "userland"
-        for path in apt.install(sorted(userland))
+        address: "required" if index[address][1]["Package"] in required else "userland"
+        for address in apt.install(sorted(userland))
     }
     for wish in asked:
         if wish.kernel:
-            selected[apt.path(apt.concrete(wish.package))] = "kernel"
+            selected[apt.address(apt.concrete(wish.package))] = "kernel"
     packages = [
         Package(
             name=fields["Package"],
@@ -289,10 +288,10 @@ def resolve(name: str, mirrors: Mirrors, without: Collection[str] = ()) -> Lock:
             archive=archive,
             size=int(fields["Size"]),
             sha256=fields["SHA256"],
-            path=path,
+            path=fields["Filename"],
         )
-        for path, role in selected.items()
-        for archive, fields in [index[path]]
+        for address, role in selected.items()
+        for archive, fields in [index[address]]
     ]
     return Lock(name, recipe.architecture, apt.suites(), tuple(sorted(packages)))
 
@@ -357,36 +356,39 @@ class Apt:
         self._run("apt-get", "update", "-q")
 
     def index(self) -> dict[str, tuple[str, dict[str, str]]]:
-        """Archive and index stanza of every package that the archives hold, by path."""
+        """Archive and index stanza of every package that the archives hold, by address."""
         return {
-            fields["Filename"]: (archive, fields)
-            for archive, suite in self.sources
-            for path in self._lists(archive, f"{suite}_*_Packages")
+            unquote(base) + fields["Filename"]: (archive, fields)
+            for archive, _, base, path in self._targets()
             for fields in mirror.stanzas(path.read_text(encoding="utf-8"))
         }
 
     def suites(self) -> tuple[Suite, ...]:
         """The suites with the dates of their Release files."""
-        return tuple(
-            Suite(archive, suite, parsedate_to_datetime(match[1]).astimezone(UTC))
-            for archive, suite in self.sources
-            for path in self._lists(archive, f"{suite}_*Release")
-            if (match := re.search(r"^Date: (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE))
-        )
+        found = set()
+        for archive, suite, _, path in self._targets():
+            prefix = re.sub(rf"(_dists_{re.escape(suite)})_.*", r"\1", str(path))
+            release = next(each for name in ("InRelease", "Release") if (each := Path(f"{prefix}_{name}")).is_file())
+            date = next(line for line in release.read_text(encoding="utf-8").splitlines() if line.startswith("Date: "))
+            found.add(Suite(archive, suite, parsedate_to_datetime(date.removeprefix("Date: ")).astimezone(UTC)))
+        return tuple(sorted(found))
 
-    def _lists(self, archive: str, pattern: str) -> list[Path]:
-        address = unquote(self.archives[archive]).partition("//")[2].replace("/", "_")
-        return sorted((self.directory / "var/lib/apt/lists").glob(f"{address}_dists_{pattern}"))
-
-    def install(self, names: Sequence[str]) -> list[str]:
-        """Paths of these packages and of all they depend on."""
+    def _targets(self) -> list[tuple[str, str, str, Path]]:
+        """Archive, suite, base address and file of every package index that was fetched."""
+        archives = {suite: archive for archive, suite in self.sources}
+        form = "$(RELEASE)\t$(REPO_URI)\t$(FILENAME)"
+        lines = self._run("apt-get", "indextargets", "--format", form, "Created-By: Packages").splitlines()
         return [
-            self._relative(line) for line in self._run("apt-get", "install", "-qq", "--print-uris", *names).splitlines()
+            (archives[suite], suite, base, Path(path)) for suite, base, path in (line.split("\t") for line in lines)
         ]
 
-    def path(self, name: str) -> str:
-        """Path of this package alone."""
-        return self._relative(self._run("apt-get", "download", "-qq", "--print-uris", name))
+    def install(self, names: Sequence[str]) -> list[str]:
+        """Addresses of these packages and of all they depend on."""
+        return [_address(line) for line in self._run("apt-get", "install", "-qq", "--print-uris", *names).splitlines()]
+
+    def address(self, name: str) -> str:
+        """Address of this package alone."""
+        return _address(self._run("apt-get", "download", "-qq", "--print-uris", name))
 
     def concrete(self, meta: str) -> str:
         """The package that a meta package stands for."""
@@ -398,13 +400,10 @@ class Apt:
             )
         return match[1]
 
-    def _relative(self, line: str) -> str:
-        """The path below its archive that a line of `--print-uris` names."""
-        address = unquote(line.split("'")[1])
-        for base in self.archives.values():
-            if address.startswith(f"{unquote(base)}/pool/"):
-                return address.removeprefix(f"{unquote(base)}/")
-        raise UserError(f"apt names {address}, which is of none of {', '.join(self.archives.values())}")
+
+def _address(line: str) -> str:
+    """The address in a line of `--print-uris`."""
+    return unquote(line.split("'")[1])
 
 
 def _proxies() -> dict[str, str]:

@@ -57,6 +57,8 @@ def resolve(
     found = dict(_configured(apt)) if _is_debian(os_release) else {}
     for archive, variable in _VARIABLES.items():
         if address := environment.get(variable):
+            if not address.startswith(_SCHEMES):
+                raise UserError(f"{variable}={address}: no address; write it like {variable}={_EXAMPLES[archive]}")
             found[archive] = address
     snapshot = environment.get("SNAPSHOT") or None
     return Mirrors(
@@ -100,7 +102,7 @@ def _sources(apt: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     for path in [apt / "sources.list", *sorted((apt / "sources.list.d").glob("*"))]:
         if not path.is_file():
             continue
-        lines = [line for line in path.read_text().splitlines() if not line.lstrip().startswith("#")]
+        lines = [line.rstrip() for line in path.read_text().splitlines() if not line.lstrip().startswith("#")]
         if path.suffix == ".list":
             for line in lines:
                 if match := _ONE_LINE.match(line.partition("#")[0].strip()):

@@ -39,6 +39,10 @@ class _GoneError(Exception):
     """The server no longer has the file."""
 
 
+class _NoSpaceError(UserError):
+    """The disk is full: no other download can do better."""
+
+
 def file(package: Package) -> Path:
     """Where the pool keeps a package."""
     return paths.POOL / f"{package.sha256}.deb"
@@ -77,7 +81,11 @@ def verify_hashes(lock: Lock) -> None:
 
 
 def repository(lock: Lock, directory: Path) -> None:
-    """A package repository of just the lock's packages, for debootstrap: `--no-check-gpg bookworm TARGET file://DIRECTORY`."""
+    """A package repository of just the lock's packages, which it verifies; no signature, so it is for
+
+    `debootstrap --no-check-gpg --variant=minbase bookworm TARGET file://DIRECTORY`.
+    """
+    verify_hashes(lock)
     index = directory / "dists" / SUITE / "main" / f"binary-{lock.architecture}"
     index.mkdir(parents=True)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
@@ -161,6 +169,8 @@ def _download_all(missing: list[tuple[Lock, Package]], mirrors: Mirrors, report:
             for future in as_completed(running):
                 try:
                     future.result()
+                except _NoSpaceError:
+                    raise
                 except UserError as error:
                     failures.append(str(error))
         except BaseException:

@@ -1,0 +1,374 @@
+"""Locks, package lists, apt as resolver against an archive made here, mirrors from fake apt configurations."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
+from pathlib import Path
+
+import pytest
+
+from images.builder import lock, mirror, paths
+from images.builder.errors import UserError
+from images.builder.lock import Lock, Package, Suite
+from images.builder.mirror import DEBIAN, SECURITY, Mirrors
+
+RELEASED = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
+LIBC = Package(
+    "libc6", "2.36-9+deb12u1", "i386", "required", DEBIAN, 7, "0" * 64, "pool/main/g/glibc/libc6_2.36_i386.deb"
+)
+LOCK = Lock("board", "i386", (Suite(DEBIAN, "bookworm", RELEASED),), (LIBC,))
+
+
+# --- text ---
+
+
+def test_text_round_trip() -> None:
+    text = lock.format_lock(LOCK)
+    assert lock.parse_lock(text, "board", "board.lock") == LOCK
+    assert lock.format_lock(lock.parse_lock(text, "board", "board.lock")) == text
+
+
+def test_digest_and_epoch_follow_the_content() -> None:
+    other = dataclasses.replace(LOCK, packages=(dataclasses.replace(LIBC, sha256="1" * 64),))
+    assert other.digest != LOCK.digest
+    assert LOCK.epoch == 1767323045
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (" 7 ", " seven ", "size 'seven' is malformed"),
+        (" 7 ", " ", "a package has 8 values"),
+        ("0" * 64, "0" * 63, "sha256"),
+        ("pool/main", "pool/../etc", "path"),
+        (" required ", " essential ", "role"),
+        ("package libc6", "packet libc6", "no architecture, suite or package"),
+        ("package libc6", "package  libc6", "9"),
+    ],
+)
+def test_malformed_line_is_named(old: str, new: str, message: str) -> None:
+    text = lock.format_lock(LOCK)
+    assert old in text
+    with pytest.raises(UserError, match=rf"^locks/board\.lock:6: .*{message}"):
+        lock.parse_lock(text.replace(old, new), "board", "locks/board.lock")
+
+
+def test_malformed_date_and_twice_the_same_package_are_named() -> None:
+    text = lock.format_lock(LOCK)
+    with pytest.raises(UserError, match=r"^board\.lock:3: "):
+        lock.parse_lock(text.replace("2026-01-02T", "2026-13-02T"), "board", "board.lock")
+    with pytest.raises(UserError, match=r"^board\.lock:7: package libc6 is locked twice"):
+        lock.parse_lock(text + text.splitlines()[-1], "board", "board.lock")
+
+
+@pytest.mark.parametrize("missing", ["architecture", "suite", "package"])
+def test_truncated_lock_is_an_error(missing: str) -> None:
+    lines = [line for line in lock.format_lock(LOCK).splitlines() if not line.startswith(missing)]
+    with pytest.raises(UserError, match=f"has no {missing} line"):
+        lock.parse_lock("\n".join(lines), "board", "board.lock")
+
+
+def test_missing_lock_says_how_to_make_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(paths, "LOCKS", tmp_path)
+    with pytest.raises(UserError, match="make lock"):
+        lock.read_lock("tools")
+
+
+def test_difference() -> None:
+    newer = dataclasses.replace(LIBC, version="2.37")
+    added = dataclasses.replace(LIBC, name="adduser", version="3.1")
+    assert lock.difference([LIBC], [added, newer]) == ["+ adduser 3.1", "~ libc6 2.36-9+deb12u1 -> 2.37"]
+    assert lock.difference([LIBC, added], [LIBC]) == ["- adduser 3.1"]
+    assert lock.difference([LIBC], [LIBC]) == []
+
+
+@pytest.mark.parametrize("line", ["sudo", "sudo less # two", "Sudo # capital", "seed sudo # unknown word"])
+def test_list_line_without_reason_or_form_is_named(line: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(paths, "PACKAGES", tmp_path)
+    (tmp_path / "robot.list").write_text(f"# all\n\nkmod # modules\n{line}\n")
+    with pytest.raises(UserError, match=r"robot\.list:4: "):
+        lock.read_list("robot")
+
+
+# --- the project's own lists and locks ---
+
+
+def unmet(name: str, locked: Lock) -> set[str]:
+    """Packages that the lists ask for and the lock lacks."""
+    have = {package.name for package in locked.packages}
+    kernels = {re.sub(r"[0-9.]+-[0-9]+-", "", package.name) for package in locked.having("kernel")}
+    return {wish.package for wish in lock.wishes(name) if wish.package not in (kernels if wish.kernel else have)}
+
+
+@pytest.mark.parametrize("name", lock.NAMES)
+def test_locks_hold_what_the_lists_ask_for(name: str) -> None:
+    locked = lock.read_lock(name)
+    assert unmet(name, locked) == set(), "the lists changed: make lock"
+    assert unmet(name, dataclasses.replace(locked, packages=())) == {wish.package for wish in lock.wishes(name)}
+
+
+@pytest.mark.parametrize("name", lock.NAMES)
+def test_locks_are_as_written_and_name_no_host(name: str) -> None:
+    text = lock.lock_file(name).read_text()
+    assert lock.format_lock(lock.read_lock(name)) == text
+    for line in text.splitlines():
+        assert "://" not in line
+        assert not re.search(r"\b[a-z0-9-]+\.(org|com|net|io|de)\b", line)
+
+
+@pytest.mark.parametrize("name", [name for name in lock.NAMES if name != "tools"])
+def test_initramfs_generators_stay_out(name: str) -> None:
+    assert not {package.name for package in lock.read_lock(name).packages} & {"initramfs-tools", "dracut", "linux-base"}
+
+
+# --- resolution, against an archive made here ---
+
+
+class Archive:
+    """A small Debian archive in a folder: three suites, signed or not."""
+
+    def __init__(self, directory: Path, home: Path | None = None) -> None:
+        self.directory = directory
+        self.home = home
+        self.expires = datetime.now(UTC) + timedelta(days=1)
+        self.suites: dict[tuple[str, str], str] = {
+            (DEBIAN, "bookworm"): stanza("libc6", "1.0", Priority="required")
+            + stanza("sed", "1.0", Essential="yes", Depends="libc6")
+            + stanza("apt", "1.0", Priority="important")
+            + stanza("tool", "1.0", Depends="helper", Recommends="extra")
+            + "".join(stanza(name, "1.0") for name in ("helper", "extra", "initramfs-tools"))
+            + stanza("linux-image-rt", "6.1", Depends="linux-image-6.1.0-9-rt (= 6.1)")
+            + stanza("linux-image-6.1.0-9-rt", "6.1", Depends="initramfs-tools"),
+            (DEBIAN, "bookworm-updates"): stanza("extra", "1.1"),
+            (SECURITY, "bookworm-security"): stanza("helper", "1.0+deb12u1"),
+        }
+
+    def write(self) -> Mirrors:
+        for (archive, suite), text in self.suites.items():
+            root = self.directory / archive / "dists" / suite
+            listing = ""
+            for component, content in {"main": text, "non-free-firmware": ""}.items():
+                index = root / component / "binary-amd64" / "Packages"
+                index.parent.mkdir(parents=True, exist_ok=True)
+                index.write_text(content)
+                listing += f" {hashlib.sha256(content.encode()).hexdigest()} {len(content)} {index.relative_to(root)}\n"
+            (root / "Release").write_text(
+                f"Origin: Debian\nSuite: {suite}\nCodename: {suite}\nArchitectures: amd64\n"
+                f"Components: main non-free-firmware\nDate: {format_datetime(RELEASED)}\n"
+                f"Valid-Until: {format_datetime(self.expires)}\nSHA256:\n{listing}"
+            )
+            if self.home:
+                gpg(self.home, "--clearsign", "-o", str(root / "InRelease"), str(root / "Release"))
+        return Mirrors({archive: f"file://{self.directory}/{archive}" for archive in mirror.ARCHIVES})
+
+
+def stanza(name: str, version: str, **fields: str) -> str:
+    values = {
+        "Package": name,
+        "Version": version,
+        "Architecture": "amd64",
+        "Maintainer": "Nobody <nobody@localhost>",
+        "Priority": "optional",
+        "Filename": f"pool/main/{name}_{version}_amd64.deb",
+        "Size": "8",
+        "SHA256": hashlib.sha256(name.encode()).hexdigest(),
+        "Description": name,
+    }
+    return "".join(f"{key}: {value}\n" for key, value in (values | fields).items()) + "\n"
+
+
+def gpg(home: Path, *arguments: str) -> None:
+    subprocess.run(
+        ["gpg", "--homedir", str(home), "--batch", "--yes", "--quiet", *arguments], check=True, capture_output=True
+    )
+
+
+@pytest.fixture(scope="module")
+def keys() -> Iterator[Path]:
+    """A GnuPG home with one key, and the keyring that trusts it; a short path, for the agent's socket."""
+    if not shutil.which("gpg"):
+        pytest.skip("needs gpg")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as directory:
+        home = Path(directory)
+        gpg(home, "--passphrase", "", "--quick-gen-key", "test@localhost", "ed25519", "sign", "never")
+        gpg(home, "-o", str(home / "trusted.gpg"), "--export")
+        yield home
+        subprocess.run(["gpgconf", "--homedir", directory, "--kill", "all"], check=False, capture_output=True)
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project with one board and a list of its own."""
+    for name in ("BUILD", "PACKAGES", "LOCKS"):
+        monkeypatch.setattr(paths, name, tmp_path / name.lower())
+    paths.PACKAGES.mkdir()
+    (paths.PACKAGES / "robot.list").write_text("tool # needed\n")
+    (paths.PACKAGES / "x86_64.list").write_text("kernel linux-image-rt # real time\n")
+    return tmp_path
+
+
+@pytest.fixture
+def signed(project: Path, keys: Path, monkeypatch: pytest.MonkeyPatch) -> Archive:
+    monkeypatch.setattr(lock, "_KEYRINGS", (keys / "trusted.gpg",))
+    return Archive(project / "archive", keys)
+
+
+def test_resolution(signed: Archive) -> None:
+    summary = lock.update_locks(["x86_64"], signed.write())
+    locked = lock.read_lock("x86_64")
+    assert {(package.name, package.version, package.role, package.archive) for package in locked.packages} == {
+        ("apt", "1.0", "userland", DEBIAN),
+        ("libc6", "1.0", "required", DEBIAN),
+        ("sed", "1.0", "required", DEBIAN),
+        ("tool", "1.0", "userland", DEBIAN),
+        ("helper", "1.0+deb12u1", "userland", SECURITY),
+        ("linux-image-6.1.0-9-rt", "6.1", "kernel", DEBIAN),
+    }
+    assert locked.epoch == int(RELEASED.timestamp())
+    assert [suite.name for suite in locked.suites] == ["bookworm", "bookworm-updates", "bookworm-security"]
+    assert "+ helper 1.0+deb12u1" in summary
+
+    text = lock.lock_file("x86_64").read_text()
+    assert lock.update_locks(["x86_64"], signed.write()) == "x86_64: unchanged"
+    assert lock.lock_file("x86_64").read_text() == text
+
+    lock.update_locks(["x86_64"], signed.write(), without=["bookworm-security"])
+    reduced = lock.read_lock("x86_64")
+    assert {package.archive for package in reduced.packages} == {DEBIAN}
+    assert {suite.archive for suite in reduced.suites} == {DEBIAN}
+
+
+def test_unknown_package_is_named(signed: Archive) -> None:
+    (paths.PACKAGES / "robot.list").write_text("misspelt # needed\n")
+    with pytest.raises(UserError, match="misspelt"):
+        lock.update_locks(["x86_64"], signed.write())
+
+
+def test_package_that_is_no_meta_package_is_no_kernel(signed: Archive) -> None:
+    (paths.PACKAGES / "x86_64.list").write_text("kernel extra # real time\n")
+    with pytest.raises(UserError, match="extra is no meta package"):
+        lock.update_locks(["x86_64"], signed.write())
+
+
+def test_unsigned_archive_is_refused(project: Path) -> None:
+    with pytest.raises(UserError, match="not signed"):
+        lock.update_locks(["x86_64"], Archive(project / "archive").write())
+    assert not lock.lock_file("x86_64").exists()
+
+
+def test_signature_of_a_stranger_is_refused(project: Path, keys: Path) -> None:
+    with pytest.raises(UserError, match="NO_PUBKEY"):
+        lock.update_locks(["x86_64"], Archive(project / "archive", keys).write())
+
+
+def test_index_that_the_signature_does_not_cover_is_refused(signed: Archive) -> None:
+    mirrors = signed.write()
+    index = signed.directory / SECURITY / "dists/bookworm-security/main/binary-amd64/Packages"
+    index.write_text(index.read_text().replace("+deb12u1", "+deb12u2"))
+    with pytest.raises(UserError, match=r"Hash Sum mismatch|unexpected size"):
+        lock.update_locks(["x86_64"], mirrors)
+
+
+def test_expired_archive_is_refused(signed: Archive) -> None:
+    signed.expires = RELEASED + timedelta(days=7)
+    with pytest.raises(UserError, match="expired"):
+        lock.update_locks(["x86_64"], signed.write())
+
+
+def test_missing_keyring_names_the_package(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lock, "_KEYRINGS", (project / "none.gpg",))
+    with pytest.raises(UserError, match="debian-archive-keyring"):
+        lock.update_locks(["x86_64"], Archive(project / "archive").write())
+
+
+# --- mirrors ---
+
+DEB822 = """\
+# one of Debian's own
+Types: deb
+# http://comment/debian
+URIs: http://first/debian/
+Suites: trixie trixie-updates
+Components: main
+
+Types: deb
+URIs: http://first/security
+Suites: trixie-security
+Components: main
+"""
+ONE_LINE = """\
+# deb http://comment/debian bookworm main
+deb-src http://source/debian bookworm main
+deb http://vendor/linux/debian bookworm stable
+deb [arch=amd64 signed-by=/k.gpg] http://first/debian bookworm main contrib # near
+deb http://second/debian bookworm main
+deb http://first/security bookworm-security main
+"""
+BOTH = {DEBIAN: "http://first/debian", SECURITY: "http://first/security"}
+
+
+@pytest.mark.parametrize(
+    ("files", "os_id", "environment", "expected"),
+    [
+        ({"sources.list.d/debian.sources": DEB822}, "debian", {}, BOTH),
+        ({"sources.list": ONE_LINE}, "debian", {}, BOTH),
+        (
+            {"sources.list": ONE_LINE},
+            '"debian"',
+            {"MIRROR": "http://mine/debian/"},
+            BOTH | {DEBIAN: "http://mine/debian"},
+        ),
+        ({"sources.list.d/debian.sources.disabled": DEB822}, "debian", {}, {}),
+        ({"sources.list.d/debian.sources": DEB822.replace("Types", "Enabled: no\nTypes")}, "debian", {}, {}),
+        ({"sources.list": ONE_LINE}, "ubuntu", {}, {}),
+        ({"sources.list": "deb http://first/ubuntu noble main\n"}, "debian", {}, {}),
+        ({"sources.list": "deb cdrom:[Debian]/ bookworm main\n"}, "debian", {}, {}),
+        ({}, "debian", {}, {}),
+        ({}, "ubuntu", {"MIRROR": BOTH[DEBIAN], "SECURITY_MIRROR": BOTH[SECURITY]}, BOTH),
+    ],
+)
+def test_mirrors(
+    tmp_path: Path, files: dict[str, str], os_id: str, environment: dict[str, str], expected: dict[str, str]
+) -> None:
+    (tmp_path / "sources.list.d").mkdir()
+    (tmp_path / "os-release").write_text(f"NAME=x\nID={os_id}\n")
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    found = mirror.resolve(environment, tmp_path, tmp_path / "os-release")
+    assert found.archives == expected
+    for archive in set(mirror.ARCHIVES) - set(expected):
+        with pytest.raises(UserError, match=r"SECURITY_MIRROR=http://MIRROR/debian-security"):
+            found.of(archive)
+
+
+def test_list_of_mirrors(tmp_path: Path) -> None:
+    (tmp_path / "os-release").write_text("ID=debian\n")
+    (tmp_path / "mirrors.list").write_text("http://first/debian\nhttp://second/debian\n")
+    (tmp_path / "sources.list").write_text(f"deb mirror+file://{tmp_path}/mirrors.list bookworm main\n")
+    assert mirror.resolve({}, tmp_path, tmp_path / "os-release").archives == {DEBIAN: "http://first/debian"}
+
+
+def test_mirror_variable_must_be_an_address() -> None:
+    with pytest.raises(UserError, match="MIRROR=deb12"):
+        mirror.resolve({"MIRROR": "deb12"})
+
+
+def test_snapshot_comes_from_the_environment(tmp_path: Path) -> None:
+    assert mirror.resolve({"SNAPSHOT": "http://old/archive/"}, tmp_path, tmp_path).snapshot == "http://old/archive"
+    assert mirror.resolve({"SNAPSHOT": ""}, tmp_path, tmp_path).snapshot is None
+
+
+def test_no_file_of_the_builder_names_a_mirror() -> None:
+    """The apt configuration of this computer knows a mirror; nothing in the project may."""
+    hosts = {base.split("/")[2] for base in mirror.resolve(os.environ).archives.values()} - {""}
+    for path in [*paths.LOCKS.iterdir(), *paths.PACKAGES.iterdir(), *Path(mirror.__file__).parent.glob("*.py")]:
+        assert not [host for host in hosts if host in path.read_text()], path
