@@ -331,6 +331,8 @@ def validate(merged: dict[str, Any], sources: Sources) -> Fleet:
 
     problems = [*sources.problems]
     for loc, message, remedy in findings:
+        if loc[0] in ("robots", "stations") and loc[2:] == ("name",):
+            loc = loc[:2]  # a host's name is the key itself
         scopes, path = groups.place(loc)
         file, value = sources.locate(scopes, path)
         key = _dotted((*loc[1:2], *path) if loc[0] in ("robots", "stations") else path)

@@ -75,7 +75,7 @@ CASES = {
         ROBOTS, "address: 10.42.0.254", "adress: 10.42.0.254", "station.adress", "mean address", also=1
     ),
     "template": Case(ROBOTS, "10.42.0.4", '"10.42.0.{{ number }}"', "robot4.address", "template…value itself"),
-    "host name": Case(ROBOTS, "robot4:", "Robot_4:", "Robot_4.name", "not a valid host name…hyphens", "Robot_4:"),
+    "host name": Case(ROBOTS, "robot4:", "Robot_4:", "Robot_4", "not a valid host name…hyphens"),
     # Its devices
     "port taken": Case(
         ROBOTS, "port: COM6", "port: COM5", "robot1.devices.magnetometer.port", "gyro is plugged…free are COM2, COM3"
