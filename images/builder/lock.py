@@ -353,7 +353,13 @@ class Apt:
 
     def update(self) -> None:
         """Fetch the indexes; apt verifies their signatures."""
-        self._run("apt-get", "update", "-q")
+        try:
+            self._run("apt-get", "update", "-q")
+        except UserError as error:
+            raise UserError(
+                f"{error}\nA lock holds only what the archive's signatures cover: run again later, or with another "
+                "MIRROR= and SECURITY_MIRROR="
+            ) from None
 
     def index(self) -> dict[str, tuple[str, dict[str, str]]]:
         """Archive and index stanza of every package that the archives hold, by address."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import gzip
 import hashlib
 import http.client
 import os
@@ -95,16 +94,10 @@ def repository(lock: Lock, directory: Path) -> None:
         _link(file(package), directory / package.path)
         stanzas.append(_stanza(package, control))
     content = "".join(stanzas).encode()
-    files = {"Packages": content, "Packages.gz": gzip.compress(content, mtime=0)}
-    for name, data in files.items():
-        (index / name).write_bytes(data)
-    listing = "".join(
-        f" {hashlib.sha256(data).hexdigest()} {len(data)} main/binary-{lock.architecture}/{name}\n"
-        for name, data in files.items()
-    )
+    (index / "Packages").write_bytes(content)
     (index.parents[1] / "Release").write_text(
         f"Origin: Debian\nSuite: {SUITE}\nCodename: {SUITE}\nArchitectures: {lock.architecture}\nComponents: main\n"
-        f"SHA256:\n{listing}",
+        f"SHA256:\n {hashlib.sha256(content).hexdigest()} {len(content)} main/binary-{lock.architecture}/Packages\n",
         encoding="utf-8",
     )
 
