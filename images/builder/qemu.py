@@ -19,7 +19,6 @@ from images.builder import paths, progress
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Network
 
-MULTICAST_GROUP = "230.0.0.77"
 CARD_BYTES = 1_000_000_000
 """What a card sold as 1 GB holds at least; larger than the images, so that the first boot grows the data partition."""
 
@@ -58,11 +57,15 @@ class UserLink:
 
 
 @dataclass(frozen=True)
-class SegmentLink:
-    """The wired port on an Ethernet segment shared with other guests: multicast datagrams on the loopback interface."""
+class Wire:
+    """The wired port on a cable, one end of it: Ethernet frames as datagrams between two loopback ports."""
 
-    port: int
-    group: str = MULTICAST_GROUP
+    here: int
+    there: int
+
+    @property
+    def other_end(self) -> Wire:
+        return Wire(self.there, self.here)
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class Options:
     """Chardev backend of the console."""
     ports: Mapping[str, str] = field(default_factory=dict)
     """Chardev backends of the board's further serial ports, by the name printed on the board; the rest is silent."""
-    link: UserLink | SegmentLink | None = None
+    link: UserLink | Wire | None = None
     """None: the wired port is there, nothing is plugged in."""
     mac: str = "52:54:00:f1:00:00"
     qmp: str | None = None
@@ -114,16 +117,16 @@ def command_line(board: Board, card: Path, options: Options) -> list[str]:
     # The network card precedes the board's devices: slots are dealt in this order, so its address never moves.
     argv += _network(board, options)
     # `-serial` counts from COM1; the ports around the console's are the board's devices.
-    argv += ["-chardev", _chardev("console", options.console), *["-serial", "none"] * int(board.console.tty[4:])]
+    argv += ["-chardev", chardev("console", options.console), *["-serial", "none"] * int(board.console.tty[4:])]
     argv += ["-serial", "chardev:console"]
     if unknown := options.ports.keys() - set(port_ids(board)):
         raise ValueError(f"board {board.name} has no port {', '.join(sorted(unknown))} besides the console")
     for port, identifier in port_ids(board).items():
-        argv += ["-chardev", _chardev(identifier, options.ports.get(port, NULL))]
+        argv += ["-chardev", chardev(identifier, options.ports.get(port, NULL))]
     for device in board.qemu.devices:
         argv += ["-device", device]
     if options.qmp:
-        argv += ["-chardev", _chardev("qmp", options.qmp), "-mon", "chardev=qmp,mode=control"]
+        argv += ["-chardev", chardev("qmp", options.qmp), "-mon", "chardev=qmp,mode=control"]
     if options.monitor:
         argv += ["-mon", "chardev=console,mode=readline"]
     return [*argv, *options.extra]
@@ -159,6 +162,12 @@ def make_overlay(image: Path, overlay: Path, size: int = 0) -> None:
         raise UserError(f"{paths.shown(overlay)}: qemu-img cannot make the overlay: {done.stderr.strip()}")
 
 
+def chardev(identifier: str, backend: str) -> str:
+    """Argument of `-chardev`."""
+    kind, comma, rest = backend.partition(",")
+    return f"{kind},id={identifier}{comma}{rest}"
+
+
 def port_ids(board: Board) -> dict[str, str]:
     """Chardev ids of the board's serial ports: `port0` its first, and so on; the console's is called otherwise."""
     return {
@@ -186,9 +195,9 @@ def user_netdev(identifier: str, subnet: IPv4Network, station: IPv4Address, forw
     return ",".join(arguments)
 
 
-def segment_netdev(identifier: str, link: SegmentLink) -> str:
-    """A multicast segment that never leaves the loopback interface."""
-    return f"socket,id={identifier},mcast={link.group}:{link.port},localaddr=127.0.0.1"
+def wire_netdev(identifier: str, wire: Wire) -> str:
+    """A cable that never leaves the loopback interface, whether or not something is at its other end."""
+    return f"socket,id={identifier},udp=127.0.0.1:{wire.there},localaddr=127.0.0.1:{wire.here}"
 
 
 def _from_above(subnet: IPv4Network) -> list[IPv4Address]:
@@ -224,16 +233,11 @@ def _network(board: Board, options: Options) -> list[str]:
     if isinstance(link, UserLink):
         netdev = user_netdev("net", link.subnet, link.station, {link.guest: link.port})
     else:
-        netdev = segment_netdev("net", link)
+        netdev = wire_netdev("net", link)
     argv = ["-netdev", netdev, "-device", f"{device},netdev=net"]
     if options.capture:
         argv += ["-object", f"filter-dump,id=capture,netdev=net,file={_escaped(options.capture)}"]
     return argv
-
-
-def _chardev(identifier: str, backend: str) -> str:
-    kind, comma, rest = backend.partition(",")
-    return f"{kind},id={identifier}{comma}{rest}"
 
 
 def _escaped(path: Path) -> str:

@@ -1,14 +1,16 @@
 """An Ethernet segment that guests share, and the host's way into it. Unprivileged, and never beyond the loopback.
 
-The segment is multicast datagrams between QEMU processes. A QEMU without a machine stands on it for the station: it
-forwards a loopback port to each robot's SSH. It is one for all guests, because each of several would answer what is
-meant for another.
+A QEMU without a machine is the hub: a cable leads from it to each robot, and its user-mode network stands for the
+station, with a loopback port forwarded to each robot's SSH.
+
+Not multicast, where every member hears itself: QEMU's user-mode network answers its own packets, thousands a second.
 """
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from contextlib import ExitStack
 from ipaddress import IPv4Address
 from pathlib import Path
 
@@ -18,14 +20,16 @@ from tests.lab.emulator import Emulator
 
 
 class Segment:
-    """Give `link` to the guests; `ssh_port()` leads to each of them."""
+    """Give each guest its `link()`; `ssh_port()` leads to it. Guests may come and go."""
 
     def __init__(self, network: Network, robots: Iterable[IPv4Address], station: IPv4Address, directory: Path) -> None:
         """`station`: the address under which the host appears on the segment."""
         directory.mkdir(parents=True, exist_ok=True)
-        self.link = qemu.SegmentLink(_free_udp_port())
-        forwards = dict.fromkeys(robots, 0)
-        self._emulator = Emulator(lambda qmp: self._command_line(network, station, forwards, qmp), directory)
+        robots = list(robots)
+        ports = _free_udp_ports(2 * len(robots))
+        self._links = {robot: qemu.Wire(*pair) for robot, *pair in zip(robots, ports[::2], ports[1::2], strict=True)}
+        user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0))
+        self._emulator = Emulator(lambda qmp: self._command_line(user, qmp), directory)
         self._ports = self._emulator.forwards()
 
     def __enter__(self) -> Segment:
@@ -34,6 +38,10 @@ class Segment:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def link(self, robot: IPv4Address) -> qemu.Wire:
+        """The robot's end of its cable."""
+        return self._links[robot]
+
     def ssh_port(self, robot: IPv4Address) -> int:
         """The loopback port that leads to a robot's SSH."""
         return self._ports[str(robot)]
@@ -41,22 +49,22 @@ class Segment:
     def close(self) -> None:
         self._emulator.kill()
 
-    def _command_line(
-        self, network: Network, station: IPv4Address, forwards: Mapping[IPv4Address, int], qmp: str
-    ) -> list[str]:
-        kind, _, rest = qmp.partition(",")
-        argv = [qemu.find_tool("qemu-system-i386"), "-name", "station", "-nodefaults", "-no-user-config"]
-        argv += ["-machine", "none", "-display", "none", "-chardev", f"{kind},id=qmp,{rest}"]
-        argv += ["-mon", "chardev=qmp,mode=control"]
-        argv += ["-netdev", qemu.user_netdev("user", network.subnet, station, forwards)]
-        argv += ["-netdev", qemu.segment_netdev("segment", self.link)]
-        for end in ("user", "segment"):
-            argv += ["-netdev", f"hubport,id=hub-{end},hubid=0,netdev={end}"]
+    def _command_line(self, user: str, qmp: str) -> list[str]:
+        argv = [qemu.find_tool("qemu-system-i386"), "-name", "segment", "-nodefaults", "-no-user-config"]
+        argv += ["-machine", "none", "-display", "none"]
+        argv += ["-chardev", qemu.chardev("qmp", qmp), "-mon", "chardev=qmp,mode=control"]
+        netdevs = {"user": user}
+        for number, wire in enumerate(self._links.values()):
+            netdevs[f"wire{number}"] = qemu.wire_netdev(f"wire{number}", wire.other_end)
+        for name, netdev in netdevs.items():
+            argv += ["-netdev", netdev, "-netdev", f"hubport,id=hub-{name},hubid=0,netdev={name}"]
         return argv
 
 
-def _free_udp_port() -> int:
-    """A port of its own for each segment keeps those of parallel test workers apart."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def _free_udp_ports(count: int) -> list[int]:
+    """Ports that nobody has; parallel test workers get others."""
+    with ExitStack() as held:  # all at once, or the same one would be found again
+        probes = [held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [int(probe.getsockname()[1]) for probe in probes]

@@ -25,12 +25,12 @@ from tests.lab import protocols, tiny
 from tests.lab.emulator import Exited
 from tests.lab.guest import Guest
 from tests.lab.segment import Segment
-from tests.lab.timing import Deadline, Expired, LabError
+from tests.lab.timing import Expired, LabError
 
 SECONDS = 60
 """Limit for what takes one or two on an idle host."""
 NETWORK = Network(subnet=IPv4Network("10.42.0.0/24"), link="ethernet", dds_domain=0, udp_ports=[])
-ROBOT, STATION = IPv4Address("10.42.0.3"), IPv4Address("10.42.0.250")
+ROBOT, OTHER, STATION = IPv4Address("10.42.0.3"), IPv4Address("10.42.0.4"), IPv4Address("10.42.0.250")
 
 
 @pytest.fixture
@@ -237,20 +237,24 @@ def test_evidence_is_kept_of_failures_only(verdict: str, tmp_path: Path) -> None
         assert str(evidence) in done.stdout
 
 
-def test_segment_joins_guests_and_leads_to_their_ssh(artefacts: Path) -> None:
-    """A few lines of Python stand for a robot: the station answers it, and looks for it when somebody calls its SSH."""
+def test_segment_joins_robots_and_leads_to_their_ssh(artefacts: Path) -> None:
+    """A few lines of Python stand for two robots."""
     mac = bytes.fromhex(qemu.robot_mac(3).replace(":", ""))
-    addresses = ROBOT.packed + STATION.packed
-    with Segment(NETWORK, [ROBOT], STATION, artefacts / "segment") as segment, _socket_on(segment) as robot:
+    with (
+        Segment(NETWORK, [ROBOT, OTHER], STATION, artefacts / "segment") as segment,
+        _plugged(segment.link(ROBOT)) as robot,
+        _plugged(segment.link(OTHER)) as other,
+    ):
         question = b"\xff" * 6 + mac + struct.pack("!HHHBBH", 0x806, 1, 0x800, 6, 4, 1)
-        question += mac + addresses[:4] + bytes(6) + addresses[4:]
-        robot.sendto(question, (segment.link.group, segment.link.port))
-        answer = _frame_to(mac, robot)
-        assert (answer[20:22], answer[28:32], answer[38:42]) == (b"\0\x02", addresses[4:], addresses[:4])
+        question += mac + ROBOT.packed + bytes(6) + STATION.packed
+        robot.send(question)
+        assert other.recv(2048) == question
+        # The station answers, and it is the first thing to come: nobody hears himself.
+        answer = robot.recv(2048)
+        assert (answer[:6], answer[20:22], answer[28:32]) == (mac, b"\0\x02", STATION.packed)
         with socket.create_connection(("127.0.0.1", segment.ssh_port(ROBOT)), SECONDS):
-            call = _frame_to(mac, robot)
-            assert call[26:34] == STATION.packed + ROBOT.packed
-            assert struct.unpack("!H", call[36:38]) == (22,)
+            call = robot.recv(2048)
+            assert (call[:6], call[26:34], call[36:38]) == (mac, STATION.packed + ROBOT.packed, b"\0\x16")
 
 
 def test_pulled_cable(image: Path, artefacts: Path) -> None:
@@ -267,22 +271,10 @@ def _readable(descriptor: int, seconds: float) -> bool:
     return bool(select.select([descriptor], [], [], seconds)[0])
 
 
-def _frame_to(mac: bytes, segment: socket.socket) -> bytes:
-    """The next Ethernet frame to this address."""
-    deadline = Deadline(SECONDS)
-    frame = b""
-    while frame[:6] != mac:
-        segment.settimeout(deadline.left or 0.001)
-        frame = segment.recv(2048)
-    return frame
-
-
-def _socket_on(segment: Segment) -> socket.socket:
-    """A socket that sends and receives Ethernet frames on the segment, as QEMU's do."""
-    joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    joined.bind((segment.link.group, segment.link.port))
-    group, loopback = socket.inet_aton(segment.link.group), socket.inet_aton("127.0.0.1")
-    joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + loopback)
-    joined.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, loopback)
-    return joined
+def _plugged(wire: qemu.Wire) -> socket.socket:
+    """A socket that sends and receives Ethernet frames on a cable, as QEMU's do."""
+    end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    end.settimeout(SECONDS)
+    end.bind(("127.0.0.1", wire.here))
+    end.connect(("127.0.0.1", wire.there))
+    return end

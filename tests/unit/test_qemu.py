@@ -153,9 +153,11 @@ def test_user_network_avoids_the_guests_address(last: int) -> None:
     assert len({str(guest), arguments["host"], arguments["dns"]}) == 3
 
 
-def test_segment_stays_on_the_loopback_interface() -> None:
-    argv = command_line(board(), link=qemu.SegmentLink(4711), capture=Path("/wire.pcap"))
-    assert values(argv, "-netdev") == ["socket,id=net,mcast=230.0.0.77:4711,localaddr=127.0.0.1"]
+def test_wire_stays_on_the_loopback_interface() -> None:
+    wire = qemu.Wire(here=4711, there=4712)
+    argv = command_line(board(), link=wire, capture=Path("/wire.pcap"))
+    assert values(argv, "-netdev") == ["socket,id=net,udp=127.0.0.1:4712,localaddr=127.0.0.1:4711"]
+    assert wire.other_end == qemu.Wire(here=4712, there=4711)
     assert values(argv, "-object") == ["filter-dump,id=capture,netdev=net,file=/wire.pcap"]
 
 
