@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from images.builder import inventory, paths, qemu
 from images.builder.build import image_of
 from images.builder.fleet import Fleet, Robot
 from tests.lab.guest import Guest
+from tests.lab.segment import Segment
 from tests.lab.ssh import Ssh
 
 pytest_plugins = ["tests.lab.artefacts"]
@@ -55,8 +57,8 @@ class RobotGuest:
 
 GuestFactory = Callable[..., RobotGuest]
 """`guest(number)`: the robot's guest, booted, with SSH connected. `fresh_guest` also takes the arguments of `Guest`
-(`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of `qemu.Options`) and `boot=False` to power it on
-oneself."""
+(`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of `qemu.Options`), `segment=segment` to put it on a
+network with others, and `boot=False` to power it on oneself."""
 
 
 @pytest.fixture(scope="session")
@@ -98,6 +100,25 @@ def fresh_guest(fleet: Fleet, artefacts: Path) -> Iterator[GuestFactory]:
         yield lambda number, **arguments: _boot(fleet, number, artefacts / f"robot{number}", cleanup, **arguments)
 
 
+@pytest.fixture
+def segment(fleet: Fleet, artefacts: Path) -> Iterator[Segment]:
+    """An Ethernet segment with a cable for each robot of the fleet, for `fresh_guest(3, segment=segment)`.
+
+    A fresh guest without one is alone with the station.
+    """
+    with Segment(
+        fleet.network, [robot.address for robot in fleet.robots.values()], _station(fleet), artefacts / "segment"
+    ) as segment:
+        yield segment
+
+
+def _station(fleet: Fleet) -> IPv4Address:
+    """What the host is to the guests."""
+    if fleet.stations:
+        return fleet.stations[0].address
+    return qemu.station_address(fleet.network, *(robot.address for robot in fleet.robots.values()))
+
+
 def _boot(
     fleet: Fleet,
     number: int,
@@ -105,6 +126,7 @@ def _boot(
     cleanup: ExitStack,
     *,
     boot: bool = True,
+    segment: Segment | None = None,
     qemu_options: dict[str, Any] | None = None,
     **arguments: Any,
 ) -> RobotGuest:
@@ -112,14 +134,15 @@ def _boot(
     image = image_of(robot)
     if not image.exists():
         pytest.fail(f"{paths.shown(image)} is missing; build it: make image ROBOT={number}", pytrace=False)
-    link = qemu.UserLink(
-        subnet=fleet.network.subnet,
-        guest=robot.address,
-        station=fleet.stations[0].address if fleet.stations else qemu.station_address(fleet.network, robot.address),
-    )
+    link: qemu.UserLink | qemu.Wire
+    if segment:
+        link = segment.link(robot.address)
+    else:
+        link = qemu.UserLink(subnet=fleet.network.subnet, guest=robot.address, station=_station(fleet))
     options = qemu.Options(**{"name": robot.name, "mac": qemu.robot_mac(number), "link": link, **(qemu_options or {})})
     machine = cleanup.enter_context(Guest(fleet.boards[robot.board], image, directory, options, **arguments))
-    guest = RobotGuest(robot, machine, cleanup.enter_context(Ssh(robot, "127.0.0.1", machine.ssh_port)))
+    port = (lambda: segment.ssh_port(robot.address)) if segment else machine.ssh_port
+    guest = RobotGuest(robot, machine, cleanup.enter_context(Ssh(robot, "127.0.0.1", port)))
     if boot:
         machine.on()
         guest.wait_booted()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import socket
 import time
 from dataclasses import replace
@@ -188,8 +187,3 @@ class Guest:
             self._emulator.kill()
             self.console.detach()
             self._emulator = None
-
-
-def without_colours(text: str) -> str:
-    """Console text as one would read it."""
-    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text).replace("\r", "")
