@@ -55,8 +55,9 @@ DATA = Partition(4, "data", 369 * MIB, 32 * MIB)
 SIZE = DATA.start + DATA.size
 
 COMMON_ARGUMENTS = ["ro", "rootfstype=squashfs", "init=/usr/lib/flotilla/preinit", "net.ifnames=0", "panic=10",
-                    "cpufreq.default_governor=performance", "quiet"]  # fmt: skip
-"""Kernel command line of every card; the board adds its own."""
+                    "cpufreq.default_governor=performance", "cryptomgr.notests", "quiet"]  # fmt: skip
+"""Kernel command line of every card; the board adds its own. The kernel's self-tests of its ciphers take two seconds of
+each boot under emulation, and more on the board."""
 
 Extents = list[tuple[int, int]]
 """Byte ranges (offset, length) of a card that hold anything."""

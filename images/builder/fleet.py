@@ -169,6 +169,8 @@ class Board(_Model):
     Images boot with `net.ifnames=0`, so the first one is `eth0` on every board."""
     disk_modules: list[Module]
     """Kernel modules needed to reach the card; they make the initramfs."""
+    modules: list[Module] = []
+    """Kernel modules of devices that no bus announces, such as an ISA watchdog; loaded on every boot."""
     qemu: Qemu
 
 

@@ -1,6 +1,4 @@
 """The initramfs: busybox, the kernel modules that reach the card, and `init`. Nothing that detects or configures.
-
-Uncompressed: it is small, and unpacking would cost the robot more than reading.
 """
 
 from __future__ import annotations

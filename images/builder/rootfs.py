@@ -151,7 +151,8 @@ def main(description_file: str) -> None:
     out = Path(description["out"])
     with _timed("initramfs"):
         image = initramfs.build(stage.tools, stage.target, version, description["disk_modules"])
-        (out / "initrd.img").write_bytes(image)
+        (stage.tools / "tmp/initrd").write_bytes(image)
+        stage.in_tools("zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img")
         shutil.move(stage.target / "boot" / f"vmlinuz-{version}", out / "vmlinuz")
         shutil.rmtree(stage.target / "boot")
         (stage.target / "boot").mkdir()
