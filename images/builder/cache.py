@@ -27,7 +27,7 @@ def digest(*parts: str | bytes | Path) -> str:
                     continue
                 name = str(path.relative_to(part.parent))
                 if path.is_symlink():
-                    content, kind = os.readlink(path).encode(), "link"
+                    content, kind = str(path.readlink()).encode(), "link"
                 else:
                     content, kind = path.read_bytes(), "x" if os.access(path, os.X_OK) else "-"
                 total.update(f"{kind} {len(name)} {name} {len(content)}\n".encode() + content)

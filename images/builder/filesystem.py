@@ -44,14 +44,17 @@ def make(
     image.unlink(missing_ok=True)
     tools.run(
         "usr/sbin/mke2fs", "-q", "-F", "-b", str(BLOCK), "-I", "256", "-i", "8192", "-m", "1", "-O", _FEATURES[kind],
-        "-L", label, "-U", uuid, "-E", f"hash_seed={uuid},lazy_itable_init=0,lazy_journal_init=0,nodiscard,root_owner=0:0",
+        "-L", label, "-U", uuid,
+        "-E", f"hash_seed={uuid},lazy_itable_init=0,lazy_journal_init=0,nodiscard,root_owner=0:0",
         image, str(size // BLOCK),
     )  # fmt: skip
     with tempfile.TemporaryDirectory(dir=image.parent) as directory:
         script = Path(directory) / "script"
         script.write_text("".join(_commands(nodes, Path(directory), epoch)))
         answer = tools.run("usr/sbin/debugfs", "-w", "-f", script, image)
-    mistakes = [line for line in answer.splitlines() if not line.startswith(("debugfs: ", "Allocated inode: ", "debugfs 1."))]
+    mistakes = [
+        line for line in answer.splitlines() if not line.startswith(("debugfs: ", "Allocated inode: ", "debugfs 1."))
+    ]
     if mistakes:
         raise UserError(f"cannot write {label} file system: " + "; ".join(mistakes))
     tools.run("usr/sbin/e2fsck", "-f", "-n", image)

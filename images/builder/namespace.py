@@ -39,11 +39,13 @@ def _refusal(stderr: str) -> UserError:
             "add one with `sudo usermod --add-subuids 100000-165535 --add-subgids 100000-165535 $USER`, "
             "or build as root with `sudo make image …`"
         )
-    return UserError(f"this computer refuses a mount namespace: {stderr.strip()}; build as root with `sudo make image …`")
+    return UserError(
+        f"this computer refuses a mount namespace: {stderr.strip()}; build as root with `sudo make image …`"
+    )
 
 
 def prefix() -> list[str]:
-    """The command that puts what follows it into namespaces; the same for root and for ordinary users but the mapping."""
+    """The command that puts what follows it into namespaces; for ordinary users with a mapping of users."""
     mapping = [] if os.geteuid() == 0 else ["--map-auto", "--map-root-user"]
     # The stage must not outlive the builder, even one that was killed.
     return ["setpriv", "--pdeathsig", "KILL", "unshare", *mapping, "--mount", "--pid", "--fork", "--kill-child", "--"]
@@ -56,12 +58,26 @@ def check() -> None:
         raise _refusal(probe.stderr)
 
 
+def moved_clock() -> dict[str, str]:
+    """libfaketime's variables, where `make verify` moves this build's clock; they must reach every program of it."""
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if name in ("LD_PRELOAD", "NO_FAKE_STAT") or "FAKETIME" in name
+    }
+
+
 def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
     """Run `python -m module arguments` in namespaces; its output goes to `log`, whose end is shown on failure."""
     argv = [*prefix(), sys.executable, "-m", module, *arguments]
     progress.command(argv)
-    environment = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LC_ALL": "C.UTF-8", "TZ": "UTC", "PYTHONPATH": str(paths.PROJECT)}
-    environment |= {name: os.environ[name] for name in ("BUILD", "V", "LD_PRELOAD", "FAKETIME") if name in os.environ}
+    environment = {
+        "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
+        "LC_ALL": "C.UTF-8",
+        "TZ": "UTC",
+        "PYTHONPATH": str(paths.PROJECT),
+    }
+    environment |= {name: os.environ[name] for name in ("BUILD", "V") if name in os.environ} | moved_clock()
     with log.open("wb") as output:
         process = subprocess.Popen(argv, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
         try:

@@ -35,7 +35,11 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     """Directory with `root.squashfs`, `vmlinuz`, `initrd.img` and `contents.json` of the board's robots."""
     sources = [Path(__file__).parent / name for name in _STAGE_FILES]
     key = cache.digest(
-        lock.digest, tools_lock.digest, board.model_dump_json(include={"disk_modules", "architecture"}), _DATA, *sources,
+        lock.digest,
+        tools_lock.digest,
+        board.model_dump_json(include={"disk_modules", "architecture"}),
+        _DATA,
+        *sources,
         *_overlay_files(),
     )
 
@@ -89,10 +93,16 @@ class Stage:
             "DEBCONF_NONINTERACTIVE_SEEN": "true",
             "container": "lxc",  # debootstrap then binds device nodes where it may not make them
         }
+        self.clock: list[str] = []
+        if "FAKETIME_LIBRARIES" in os.environ:  # make verify; `env`, because the place exists inside the chroot only
+            moved = namespace.moved_clock() | {"LD_PRELOAD": "/run/faketime/$LIB/libfaketime.so.1"}
+            self.clock = ["env", *(f"{name}={value}" for name, value in moved.items())]
 
     def run(self, root: Path, *argv: str) -> str:
         print("+", *argv, flush=True)
-        done = subprocess.run(["chroot", str(root), *argv], env=self.environment, stdout=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            ["chroot", str(root), *self.clock, *argv], env=self.environment, stdout=subprocess.PIPE, text=True
+        )
         print(done.stdout, flush=True)
         if done.returncode != 0:
             raise SystemExit(f"{argv[0]} failed with status {done.returncode}")
@@ -129,6 +139,10 @@ def _mounts(stage: Stage, repository: str, out: str) -> None:
     _mount("-t", "proc", "proc", str(root / "proc"))
     _mount("--bind", repository, str(root / "repository"))
     _mount("--bind", out, str(root / "out"))
+    if stage.clock:
+        for place in (root / "run/faketime", stage.target / "run/faketime"):
+            place.mkdir(parents=True)
+            _mount("--bind", os.environ["FAKETIME_LIBRARIES"], str(place))
 
 
 def main(description_file: str) -> None:
@@ -138,8 +152,11 @@ def main(description_file: str) -> None:
     os.nice(5)
     stage = Stage(description)
     _mounts(stage, description["repository"], description["out"])
+    print(f"clock of the stage: {time.strftime('%F')}")
+    stage.in_tools("date", "+clock of the tools: %F")
     with _timed("debootstrap"):
         _bootstrap(stage, description["architecture"], description["packages"])
+    stage.in_target("date", "+clock of the target: %F")
     with _timed("kernel"):
         version = _kernel(stage, description["kernels"])
     with _timed("overlay"):
@@ -159,7 +176,8 @@ def main(description_file: str) -> None:
     with _timed("squashfs"):
         _settle_times(stage)
         stage.in_tools(
-            "env", "-u", "SOURCE_DATE_EPOCH", "mksquashfs", "/target", "/out/root.squashfs", *COMPRESSION, "-noappend", "-no-progress", "-exports",
+            "env", "-u", "SOURCE_DATE_EPOCH", "mksquashfs", "/target", "/out/root.squashfs", *COMPRESSION,
+            "-noappend", "-no-progress", "-exports",
             "-mkfs-time", str(stage.epoch), "-all-time", str(stage.epoch),
             "-wildcards", "-e", "dev/*", "proc/*", "sys/*", "run/*", "tmp/*", "debootstrap",
         )  # fmt: skip
@@ -247,7 +265,7 @@ def _lay_overlay(target: Path) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
         if source.is_symlink():
             place.unlink(missing_ok=True)
-            place.symlink_to(os.readlink(source))
+            place.symlink_to(source.readlink())
         else:
             shutil.copyfile(source, place)
             place.chmod(0o755 if os.access(source, os.X_OK) else 0o644)
@@ -257,29 +275,17 @@ def _configure(stage: Stage) -> None:
     """Accounts, services and mount points: what the overlay's files cannot say by themselves."""
     stage.in_target("groupadd", "--system", "realtime")
     stage.in_target(
-        "useradd", "--uid", "1000", "--user-group", "--no-create-home", "--home-dir", "/home/robot", "--shell", "/bin/bash",
-        "--groups", "dialout,video,realtime", "robot",
+        "useradd", "--uid", "1000", "--user-group", "--no-create-home", "--home-dir", "/home/robot",
+        "--shell", "/bin/bash", "--groups", "dialout,video,realtime", "robot",
     )  # fmt: skip
     stage.in_target("systemctl", "preset-all", "--preset-mode=full")
     (stage.target / "data").mkdir()
 
 
-_LEFTOVERS = """
-etc/.pwd.lock etc/apt/sources.list etc/dpkg/dpkg.cfg.d/flotilla etc/group- etc/gshadow- etc/passwd- etc/shadow-
-etc/subgid- etc/subuid- etc/hostname etc/resolv.conf etc/ssh/ssh_host_* root/.bash_history root/.wget-hsts
-usr/lib/udev/hwdb.bin etc/udev/hwdb.bin
-var/cache/apt/* var/cache/debconf/*-old var/cache/ldconfig/aux-cache var/lib/apt/lists/* var/lib/dpkg/*-old
-var/lib/dpkg/lock* var/lib/systemd/random-seed var/lib/systemd/catalog/database
-var/log/alternatives.log var/log/apt/* var/log/bootstrap.log var/log/dpkg.log var/lib/dpkg/triggers/Lock
-var/cache/ldconfig
-""".split()
-"""What a bootstrap leaves behind that depends on when and where it ran, or that a read-only root has no use for."""
-
-
 def _clean(stage: Stage) -> dict[str, object]:
     """Remove what differs from build to build; return what is left, by package."""
     sizes = stage.in_target("dpkg-query", "-W", "-f", "${Package} ${Version} ${Installed-Size}\\n")
-    for pattern in _LEFTOVERS:
+    for pattern in _list("leftovers.list"):
         for path in stage.target.glob(pattern):
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)

@@ -1,0 +1,76 @@
+"""Results of build steps: made once, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from images.builder import cache, paths
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paths, "CACHE", tmp_path / "cache")
+
+
+def test_a_result_is_made_once() -> None:
+    calls: list[Path] = []
+
+    def make(out: Path) -> None:
+        calls.append(out)
+        (out / "file").touch()
+
+    for _ in range(2):
+        made = cache.result("kind", "0123456789abcdef", make)
+    assert len(calls) == 1
+    assert (made / "file").exists()
+
+
+def test_a_failed_step_leaves_nothing_that_could_be_taken_for_a_result() -> None:
+    def fail(out: Path) -> None:
+        (out / "half").touch()
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        cache.result("kind", "0123456789abcdef", fail)
+    assert list(paths.CACHE.iterdir()) == []
+
+
+def test_what_a_killed_build_left_is_removed_by_the_next() -> None:
+    left = paths.CACHE / "kind-0123456789abcdef.part"
+    left.mkdir(parents=True)
+    (left / "half").touch()
+    made = cache.result("kind", "0123456789abcdef", lambda out: (out / "whole").touch())
+    assert [path.name for path in made.iterdir()] == ["whole"]
+    assert not left.exists()
+
+
+@pytest.mark.parametrize("change", ["content", "name", "executable", "new file", "link"])
+def test_the_digest_sees_every_change_that_matters(tmp_path: Path, change: str) -> None:
+    tree = tmp_path / "tree"
+    tree.mkdir()
+    file = tree / "a"
+    file.write_text("one")
+    before = cache.digest("text", tree)
+    assert before == cache.digest("text", tree)
+    changes: dict[str, Callable[[], object]] = {
+        "content": lambda: file.write_text("two"),
+        "name": lambda: file.rename(tree / "b"),
+        "executable": lambda: file.chmod(0o755),
+        "new file": lambda: (tree / "c").touch(),
+        "link": lambda: (tree / "d").symlink_to("a"),
+    }
+    changes[change]()
+    assert cache.digest("text", tree) != before
+
+
+def test_the_digest_does_not_see_umask_and_times(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    file.write_text("one")
+    file.chmod(0o644)
+    before = cache.digest(file)
+    file.chmod(0o600)
+    file.touch()
+    assert cache.digest(file) == before

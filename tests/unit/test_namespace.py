@@ -1,0 +1,75 @@
+"""Stages in namespaces: what they leave behind, and what is said where the host forbids them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from images.builder import namespace
+from images.builder.errors import UserError
+
+
+def _mounts() -> str:
+    return Path("/proc/self/mounts").read_text()
+
+
+def test_mounts_of_a_stage_are_its_own() -> None:
+    before = _mounts()
+    script = "mount -t tmpfs none /mnt && grep -c ' /mnt ' /proc/self/mounts"
+    done = subprocess.run([*namespace.prefix(), "sh", "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "1"
+    assert _mounts() == before
+
+
+def test_a_killed_builder_takes_its_stage_along(tmp_path: Path) -> None:
+    """The builder is killed so that it cannot clean up; the stage's end of a pipe tells that all of it is gone."""
+    read, write = os.pipe()
+    code = (
+        "import subprocess, sys\nfrom images.builder import namespace\n"
+        "stage = [*namespace.prefix(), 'sh', '-c', 'echo started; sleep 600 & wait']\n"
+        "subprocess.run(stage, pass_fds=[int(sys.argv[1])])\n"
+    )
+    builder = subprocess.Popen(
+        [sys.executable, "-c", code, str(write)],
+        pass_fds=[write],
+        stdout=subprocess.PIPE,
+        cwd=Path(__file__).parents[2],
+    )
+    os.close(write)
+    assert builder.stdout is not None
+    assert builder.stdout.readline() == b"started\n"
+    builder.send_signal(signal.SIGKILL)
+    builder.wait()
+    assert os.read(read, 1) == b"", "the pipe is closed by the last process of the stage"
+    os.close(read)
+    builder.stdout.close()
+
+
+def test_the_end_of_the_log_is_shown_when_a_stage_fails(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"no_such_stage failed \(status 1\).*\n.*No module named"):
+        namespace.run_stage("images.builder.no_such_stage", [], tmp_path / "log")
+
+
+def test_a_forbidden_user_namespace_names_the_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    real = Path.read_text
+    monkeypatch.setattr(Path, "exists", lambda path: "apparmor_restrict" in str(path))
+    monkeypatch.setattr(Path, "read_text", lambda path, *rest: "1\n" if "apparmor" in str(path) else real(path, *rest))
+    message = str(namespace._refusal("unshare: write failed /proc/self/uid_map: Operation not permitted"))
+    assert "apparmor_restrict_unprivileged_userns: 1: this computer forbids user namespaces" in message
+    assert "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0" in message
+    assert "sudo make image" in message
+
+
+def test_a_user_without_a_range_is_told_how_to_get_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setenv("USER", "ada")
+    message = str(namespace._refusal("newuidmap: uid range [1-65536) -> [100000-165535) not allowed"))
+    assert message.startswith("/etc/subuid: no range for ada")
+    assert "--add-subuids" in message
