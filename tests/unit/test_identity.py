@@ -1,0 +1,124 @@
+"""What the templates of rootfs_overlay/ become for a robot."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+from images.builder import identity, paths
+from images.builder.errors import UserError
+from images.builder.fleet import Fleet, Ibss, IsaResources, Robot
+from images.builder.inventory import load_fleet
+
+
+@pytest.fixture(scope="module")
+def fleet() -> Fleet:
+    return load_fleet()
+
+
+@pytest.fixture(autouse=True)
+def _keys(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    # One directory for all tests: keys are made once.
+    monkeypatch.setattr(paths, "KEYS", tmp_path_factory.getbasetemp() / "keys")
+
+
+def _text(fleet: Fleet, robot: Robot, path: str) -> str:
+    return identity.render(fleet, robot)[PurePosixPath(path)][0].decode()
+
+
+def test_robots_differ_where_they_should(fleet: Fleet) -> None:
+    three, four = (identity.render(fleet, fleet.robots[number]) for number in (3, 4))
+    differing = {str(path) for path in three | four if three.get(path) != four.get(path)}
+    assert differing == {
+        "/etc/chrony/chrony.conf", "/etc/hostname", "/etc/machine-id", "/etc/ssh/ssh_host_ed25519_key",
+        "/etc/ssh/ssh_host_ed25519_key.pub", "/etc/systemd/network/10-fleet.network", "/etc/udev/rules.d/70-robot.rules",
+    }  # fmt: skip
+
+
+def test_rendering_repeats(fleet: Fleet) -> None:
+    assert identity.render(fleet, fleet.robots[3]) == identity.render(fleet, fleet.robots[3])
+
+
+def test_keys_are_made_once_pinned_and_private(fleet: Fleet) -> None:
+    first = identity.host_keys(fleet)
+    assert identity.host_keys(fleet) == first
+    assert len(set(first.values())) == len(fleet.robots)
+    assert stat.S_IMODE((paths.KEYS / "robot3_ed25519").stat().st_mode) == 0o600
+    known = (paths.KEYS / "known_hosts").read_text()
+    assert f"robot3,{fleet.robots[3].address} {first['robot3']}\n" in known
+    content, mode = identity.render(fleet, fleet.robots[3])[PurePosixPath("/etc/ssh/ssh_host_ed25519_key")]
+    assert mode == 0o600
+    assert content == (paths.KEYS / "robot3_ed25519").read_bytes()
+
+
+def test_every_port_in_use_gets_its_name_and_baud_rate(fleet: Fleet) -> None:
+    rules = _text(fleet, fleet.robots[1], "/etc/udev/rules.d/70-robot.rules")
+    for name, device in fleet.robots[1].devices.items():
+        (line,) = (line for line in rules.splitlines() if f'SYMLINK+="robot/{name}"' in line)
+        assert f'KERNEL=="{fleet.boards["smartcoret3"].ports[device.port].tty}"' in line
+        assert f" {device.baud} raw" in line
+    assert "setserial" not in rules
+
+
+def test_a_port_with_jumpers_is_declared_before_it_is_used(fleet: Fleet) -> None:
+    board = fleet.boards["smartcoret3"]
+    port = board.ports["COM5"].model_copy(update={"isa": IsaResources(io=0x100, irq=5)})
+    board = board.model_copy(update={"ports": board.ports | {"COM5": port}})
+    jumpers = fleet.model_copy(update={"boards": fleet.boards | {"smartcoret3": board}})
+    rules = _text(jumpers, jumpers.robots[3], "/etc/udev/rules.d/70-robot.rules")
+    assert "/bin/setserial /dev/%k port 0x100 irq 5 uart 16550A" in rules
+    assert rules.index("setserial") < rules.index("robot/gyro")
+
+
+def test_an_ad_hoc_cell_moves_the_address_to_the_radio(fleet: Fleet) -> None:
+    ibss = Ibss(ssid="fleet", frequency_mhz=2412, bssid="02:11:22:33:44:55")
+    network = fleet.network.model_copy(update={"link": "ibss", "ibss": ibss})
+    radio = fleet.model_copy(update={"network": network})
+    assert "Name=wlan0" in _text(radio, radio.robots[3], "/etc/systemd/network/10-fleet.network")
+    assert "BSSID=02:11:22:33:44:55" in _text(radio, radio.robots[3], "/etc/flotilla/ibss.conf")
+    assert "flotilla-ibss@" in _text(radio, radio.robots[3], "/etc/udev/rules.d/70-robot.rules")
+    assert PurePosixPath("/etc/flotilla/ibss.conf") not in identity.render(fleet, fleet.robots[3]), (
+        "not with a wired port"
+    )
+
+
+def test_the_firewall_admits_the_fleet_alone(fleet: Fleet) -> None:
+    rules = _text(fleet, fleet.robots[3], "/etc/nftables.conf")
+    assert "policy drop" in rules
+    assert f"ip saddr != {fleet.network.subnet} drop" in rules
+    first = 7400 + 250 * fleet.network.dds_domain
+    assert f"{first}-{first + 249}" in rules
+
+
+def test_parents_come_before_children(fleet: Fleet) -> None:
+    seen = {PurePosixPath("/")}
+    for node in identity.nodes(fleet, fleet.robots[3]):
+        assert node.path.parent in seen, node.path
+        seen.add(node.path)
+
+
+def test_a_template_outside_etc_is_refused(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "usr").mkdir()
+    (tmp_path / "usr/file.j2").write_text("{{ robot.name }}\n")
+    monkeypatch.setattr(paths, "OVERLAY", tmp_path)
+    identity._environment.cache_clear()
+    with pytest.raises(UserError, match=r"rootfs_overlay/usr/file\.j2: templates lie below etc/"):
+        identity.nodes(fleet, fleet.robots[3])
+    identity._environment.cache_clear()
+
+
+def test_a_mistake_in_a_template_names_the_file(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "etc").mkdir()
+    (tmp_path / "etc/file.j2").write_text("{{ robot.nmae }}\n")
+    monkeypatch.setattr(paths, "OVERLAY", tmp_path)
+    identity._environment.cache_clear()
+    with pytest.raises(UserError, match=r"etc/file\.j2: .*nmae"):
+        identity.render(fleet, fleet.robots[3])
+    identity._environment.cache_clear()
+
+
+def test_the_fleet_model_survives_a_round_trip(fleet: Fleet) -> None:
+    assert Fleet.model_validate(json.loads(fleet.model_dump_json())) == fleet
