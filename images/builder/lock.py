@@ -45,6 +45,7 @@ _RECIPES = {
     "smartcoret3": _Recipe("i386", ("robot", "smartcoret3")),
     "x86_64": _Recipe("amd64", ("robot", "x86_64")),
     "tools": _Recipe("amd64", ("tools",), system=False),
+    "verify": _Recipe("i386", ("verify",), system=False),
 }
 NAMES = tuple(_RECIPES)
 

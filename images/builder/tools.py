@@ -10,7 +10,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from images.builder import cache, pool, progress
+from images.builder import cache, namespace, pool, progress
 from images.builder.errors import UserError
 from images.builder.lock import Lock
 
@@ -52,6 +52,7 @@ class Tools:
             "SOURCE_DATE_EPOCH": str(epoch),
             "E2FSPROGS_FAKE_TIME": str(epoch),
             "MKE2FS_CONFIG": os.devnull,
+            **namespace.moved_clock(),
         }
 
     def run(self, program: str, *arguments: str | Path, stdin: str | None = None) -> str:
