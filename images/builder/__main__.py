@@ -42,6 +42,13 @@ def _ssh(arguments: argparse.Namespace) -> None:
     boot.ssh(inventory.robot(inventory.load_fleet(), arguments.robot))
 
 
+def _verify(arguments: argparse.Namespace) -> None:
+    from images.builder import inventory, verify
+
+    fleet = inventory.load_fleet()
+    print(verify.verify(fleet, inventory.robot(fleet, arguments.robot), plant=arguments.plant))
+
+
 def _lock(_: argparse.Namespace) -> None:
     from images.builder import lock
 
@@ -59,6 +66,7 @@ _COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
     "flash": (_flash, "write a card and read it back"),
     "boot": (_boot, "boot an image in QEMU"),
     "ssh": (_ssh, "shell on a robot"),
+    "verify": (_verify, "build a second time under other circumstances and compare"),
     "lock": (_lock, "resolve the package lists"),
     "check-fleet": (_check_fleet, "validate the inventory"),
 }
@@ -68,9 +76,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m images.builder", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
-    for name in ("image", "flash", "boot", "ssh"):
+    for name in ("image", "flash", "boot", "ssh", "verify"):
         made[name].add_argument("--robot", type=int, help="number in the inventory")
     made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
+    made["verify"].add_argument("--plant", action="store_true", help="plant a difference, which must be found")
     target = made["flash"].add_mutually_exclusive_group(required=True)
     target.add_argument("--device", type=Path, help="the card: /dev/sdX")
     target.add_argument("--file", type=Path, help="a file instead of a card")

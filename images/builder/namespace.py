@@ -44,11 +44,16 @@ def _refusal(stderr: str) -> UserError:
     )
 
 
-def prefix() -> list[str]:
-    """The command that puts what follows it into namespaces; for ordinary users with a mapping of users."""
-    mapping = [] if os.geteuid() == 0 else ["--map-auto", "--map-root-user"]
+def prefix(*more: str, root: bool | None = None) -> list[str]:
+    """The command that puts what follows it into namespaces; the same for root and for ordinary users but the mapping.
+
+    `more` are further options of unshare(1); `root` says who runs the command, where that is somebody else.
+    """
+    root = os.geteuid() == 0 if root is None else root
+    mapping = [] if root else ["--map-auto", "--map-root-user"]
     # The stage must not outlive the builder, even one that was killed.
-    return ["setpriv", "--pdeathsig", "KILL", "unshare", *mapping, "--mount", "--pid", "--fork", "--kill-child", "--"]
+    options = [*mapping, "--mount", "--pid", "--fork", "--kill-child", *more]
+    return ["setpriv", "--pdeathsig", "KILL", "unshare", *options, "--"]
 
 
 def check() -> None:
@@ -59,11 +64,14 @@ def check() -> None:
 
 
 def moved_clock() -> dict[str, str]:
-    """libfaketime's variables, where `make verify` moves this build's clock; they must reach every program of it."""
+    """libfaketime's variables, where `make verify` moves this build's clock; they must reach every program of it.
+
+    All but the one by which programs share a semaphore: that may be of another user, root directory or word size.
+    """
     return {
         name: value
         for name, value in os.environ.items()
-        if name in ("LD_PRELOAD", "NO_FAKE_STAT") or "FAKETIME" in name
+        if (name in ("LD_PRELOAD", "NO_FAKE_STAT") or name.startswith("FAKETIME")) and name != "FAKETIME_SHARED"
     }
 
 

@@ -140,9 +140,10 @@ def _mounts(stage: Stage, repository: str, out: str) -> None:
     _mount("--bind", repository, str(root / "repository"))
     _mount("--bind", out, str(root / "out"))
     if stage.clock:
-        for place in (root / "run/faketime", stage.target / "run/faketime"):
-            place.mkdir(parents=True)
-            _mount("--bind", os.environ["FAKETIME_LIBRARIES"], str(place))
+        for chroot in (root, stage.target):
+            (chroot / "dev/shm").mkdir(parents=True)  # libfaketime insists on semaphores
+            (chroot / "run/faketime").mkdir(parents=True)
+            _mount("--bind", os.environ["FAKETIME_LIBRARIES"], str(chroot / "run/faketime"))
 
 
 def main(description_file: str) -> None:
@@ -156,7 +157,7 @@ def main(description_file: str) -> None:
     stage.in_tools("date", "+clock of the tools: %F")
     with _timed("debootstrap"):
         _bootstrap(stage, description["architecture"], description["packages"])
-    stage.in_target("date", "+clock of the target: %F")
+    stage.in_target("perl", "-MPOSIX=strftime", "-e", 'print strftime("clock of the target: %F\\n", gmtime)')
     with _timed("kernel"):
         version = _kernel(stage, description["kernels"])
     with _timed("overlay"):

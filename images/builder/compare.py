@@ -1,0 +1,182 @@
+"""Where two card images differ: which part of the card, which file in it, from which byte on."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from images.builder import card
+from images.builder.tools import Tools
+
+_BLOCK = 4096
+_CHUNK = 1 << 20
+_EXCERPT = 16
+_FILES_NAMED = 40
+
+
+@dataclass(frozen=True)
+class Part:
+    """A range of the card with a meaning of its own."""
+
+    name: str
+    start: int
+    end: int
+
+
+PARTS = (
+    Part("MBR", 0, 512),
+    Part("GRUB's core image", 512, card.BOOT.start),
+    *(
+        Part(name, partition.start, partition.start + partition.size)
+        for name, partition in (
+            ("boot partition", card.BOOT),
+            *((f"slot {slot.name}", slot) for slot in card.SLOTS),
+            ("data partition", card.DATA),
+        )
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """That a part differs."""
+
+    part: Part
+    first: int
+    """Bytes from the start of the part to the first that differs."""
+    blocks: int
+    """How many blocks of 4096 bytes differ."""
+
+    def __str__(self) -> str:
+        return f"{self.part.name}: differs from byte {self.first} on, in {self.blocks} blocks"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file, directory or link in a file system."""
+
+    metadata: str
+    content: Path | None = None
+    """A regular file's content."""
+
+
+def differing_parts(first: Path, second: Path) -> list[Difference]:
+    """The parts of the card that differ. Whatever lies beyond them counts as a part, too."""
+    end = max(first.stat().st_size, second.stat().st_size)
+    beyond = [Part("beyond the last partition", card.SIZE, end)] if end > card.SIZE else []
+    found = []
+    with first.open("rb") as one, second.open("rb") as other:
+        for part in (*PARTS, *beyond):
+            position, blocks = None, 0
+            for start in range(part.start, part.end, _CHUNK):
+                size = min(_CHUNK, part.end - start)
+                one.seek(start)
+                other.seek(start)
+                left, right = one.read(size), other.read(size)
+                if left == right:
+                    continue
+                if position is None:
+                    position = start - part.start + first_difference(left, right)
+                blocks += sum(left[at : at + _BLOCK] != right[at : at + _BLOCK] for at in range(0, size, _BLOCK))
+            if position is not None:
+                found.append(Difference(part, position, blocks))
+    return found
+
+
+def first_difference(left: bytes, right: bytes) -> int:
+    """The first position where they differ; one may be the beginning of the other."""
+    low, high = 0, min(len(left), len(right))
+    if left[:high] == right[:high]:
+        return high
+    while high - low > 1:  # they differ between low and high, and nowhere before
+        middle = (low + high) // 2
+        low, high = (low, middle) if left[low:middle] != right[low:middle] else (middle, high)
+    return low
+
+
+def differing_files(first: Mapping[str, Entry], second: Mapping[str, Entry]) -> list[str]:
+    """What differs between two file systems, a line each."""
+    lines = []
+    for name in sorted(first.keys() | second.keys()):
+        if name not in first or name not in second:
+            lines.append(f"{name}: only in the {'first' if name in first else 'second'} image")
+            continue
+        one, other = first[name], second[name]
+        if one.metadata != other.metadata:
+            lines.append(f"{name}: {_contrast(one.metadata, other.metadata)}")
+        if one.content and other.content:
+            left, right = one.content.read_bytes(), other.content.read_bytes()
+            if left != right:
+                at = first_difference(left, right)
+                excerpt = f": {left[at : at + _EXCERPT]!r} / {right[at : at + _EXCERPT]!r}"
+                public = one.content.stat().st_mode & other.content.stat().st_mode & 0o004  # keys stay unseen
+                lines.append(f"{name}: differs from byte {at} on{excerpt if public else ''}")
+    return lines
+
+
+def _contrast(one: str, other: str) -> str:
+    """The words that differ."""
+    left, right = one.split(), other.split()
+    if len(left) != len(right):
+        return f"{one} / {other}"
+    pairs = [(mine, theirs) for mine, theirs in zip(left, right, strict=True) if mine != theirs]
+    return f"{' '.join(mine for mine, _ in pairs)} / {' '.join(theirs for _, theirs in pairs)}"
+
+
+def images(first: Path, second: Path, tools: Tools, work: Path) -> list[str]:
+    """What differs between two card images, a line each; nothing when they are identical. `work` is for files."""
+    lines = []
+    for difference in differing_parts(first, second):
+        lines.append(str(difference))
+        part = difference.part
+        if part.name.startswith("slot"):
+            read = squashfs_files
+        elif part.name.endswith(" partition"):
+            read = ext_files
+        else:
+            continue
+        place = work / part.name.replace(" ", "-")
+        trees = []
+        for number, image in enumerate((first, second)):
+            (place / str(number)).mkdir(parents=True)
+            trees.append(read(tools, image, part.start, place / str(number)))
+        files = differing_files(*trees)
+        lines += [f"  {line}" for line in files[:_FILES_NAMED]] or ["  the same files, stored differently"]
+        if len(files) > _FILES_NAMED:
+            lines.append(f"  and {len(files) - _FILES_NAMED} more files")
+    return lines
+
+
+def squashfs_files(tools: Tools, image: Path, offset: int, work: Path) -> dict[str, Entry]:
+    """The files of the squashfs at `offset`, unpacked into `work`."""
+    listing = tools.run("usr/bin/unsquashfs", "-o", str(offset), "-lln", image)
+    tools.run("usr/bin/unsquashfs", "-o", str(offset), "-q", "-n", "-no-xattrs", "-f", "-d", work, image)
+    return squashfs_listing(listing, work)
+
+
+def squashfs_listing(listing: str, work: Path) -> dict[str, Entry]:
+    """The entries of `unsquashfs -lln`, whose contents are in `work`."""
+    entries = {}
+    for line in listing.splitlines():
+        if match := re.fullmatch(r"(\S+ +\d+/\d+ .*\d{4}-\d\d-\d\d \d\d:\d\d) squashfs-root(.*)", line):
+            name, _, target = match[2].partition(" -> ")
+            content = work / name.removeprefix("/") if line.startswith("-") else None
+            entries[name or "/"] = Entry(" ".join((*match[1].split(), *([f"-> {target}"] if target else []))), content)
+    return entries
+
+
+def ext_files(tools: Tools, image: Path, offset: int, work: Path) -> dict[str, Entry]:
+    """The files of the ext2 or ext4 at `offset`, unpacked into `work`, with their inodes."""
+    where = f"{image}?offset={offset}"
+    (work / "files").mkdir()
+    tools.run("usr/sbin/debugfs", "-R", f"rdump / {work / 'files'}", where)
+    found = {"/" + str(path.relative_to(work / "files")): path for path in sorted((work / "files").rglob("*"))}
+    script = work / "script"
+    script.write_text("".join(f'stat "{name}"\n' for name in found))
+    inodes = tools.run("usr/sbin/debugfs", "-f", script, where).split("debugfs: stat ")[1:]
+    return {
+        name: Entry(" ".join(inode.split("\n", 1)[1].split()), path if path.is_file() else None)
+        for (name, path), inode in zip(found.items(), inodes, strict=True)
+    }
