@@ -24,7 +24,7 @@ def _flash(arguments: argparse.Namespace) -> None:
     robot = inventory.robot(inventory.load_fleet(), arguments.robot)
     flash.flash(
         build.image_of(robot), device=arguments.device, file=arguments.file, force=arguments.force, yes=arguments.yes,
-        robot=robot.name,
+        robot=str(robot.number),
     )  # fmt: skip
 
 
@@ -33,7 +33,8 @@ def _boot(arguments: argparse.Namespace) -> None:
 
     fleet = inventory.load_fleet()
     robot = inventory.robot(fleet, arguments.robot)
-    boot.boot(robot, fleet.boards[robot.board], fleet.network, build.image_of(robot))
+    station = fleet.stations[0].address if fleet.stations else None
+    boot.boot(robot, fleet.boards[robot.board], fleet.network, build.image_of(robot), station=station)
 
 
 def _ssh(arguments: argparse.Namespace) -> None:
@@ -47,6 +48,13 @@ def _verify(arguments: argparse.Namespace) -> None:
 
     fleet = inventory.load_fleet()
     print(verify.verify(fleet, inventory.robot(fleet, arguments.robot), plant=arguments.plant))
+
+
+def _size(arguments: argparse.Namespace) -> None:
+    from images.builder import build, inventory, size
+
+    robot = inventory.robot(inventory.load_fleet(), arguments.robot)
+    print(size.report(build.image_of(robot), remedy=f"make image ROBOT={robot.number}"))
 
 
 def _lock(_: argparse.Namespace) -> None:
@@ -66,6 +74,7 @@ _COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
     "flash": (_flash, "write a card and read it back"),
     "boot": (_boot, "boot an image in QEMU"),
     "ssh": (_ssh, "shell on a robot"),
+    "size": (_size, "what takes the room of an image"),
     "verify": (_verify, "build a second time under other circumstances and compare"),
     "lock": (_lock, "resolve the package lists"),
     "check-fleet": (_check_fleet, "validate the inventory"),
@@ -76,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m images.builder", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
-    for name in ("image", "flash", "boot", "ssh", "verify"):
+    for name in ("image", "flash", "boot", "ssh", "size", "verify"):
         made[name].add_argument("--robot", type=int, help="number in the inventory")
     made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
     made["verify"].add_argument("--plant", action="store_true", help="plant a difference, which must be found")

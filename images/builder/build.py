@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from images.builder import bmap, cache, card, identity, namespace, paths, pool, progress, rootfs, tools
-from images.builder.errors import UserError
+from images.builder import bmap, cache, card, host, identity, manifest, namespace, paths, pool, progress, rootfs, tools
 from images.builder.fleet import Board, Fleet, Robot
 from images.builder.lock import Lock, read_lock
 
@@ -21,9 +18,11 @@ class BoardBuild:
 
     board: Board
     lock: Lock
+    tools_lock: Lock
     tools: tools.Tools
     root: Path
     base: Path
+    manifest: Path
 
 
 def image_of(robot: Robot) -> Path:
@@ -36,11 +35,14 @@ def board_build(board: Board) -> BoardBuild:
     pool.fill([lock, tools_lock])
     toolset = tools.Tools(tools.tree(tools_lock), lock.epoch)
     root = rootfs.build(board, lock, tools_lock)
-    return BoardBuild(board, lock, toolset, root, card.base(board, root, toolset, lock.epoch))
+    base = card.base(board, root, toolset, lock.epoch)
+    return BoardBuild(board, lock, tools_lock, toolset, root, base, manifest.shared(board, lock, root, base, toolset))
 
 
 def build(fleet: Fleet, robots: list[Robot]) -> list[Path]:
     """Make the images of `robots`; each is replaced only when it is complete."""
+    host.check()
+    namespace.check()
     with cache.exclusive():
         boards: dict[str, BoardBuild] = {}
         for robot in robots:
@@ -50,28 +52,38 @@ def build(fleet: Fleet, robots: list[Robot]) -> list[Path]:
 
 
 def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild) -> Path:
+    """Hashing takes longest, and lets other threads work: the board's part is hashed while the robot's is made."""
     started = time.monotonic()
     final = image_of(robot)
     work = paths.IMAGES / f".{robot.name}.part"
     cache.discard(work)
     work.mkdir(parents=True)
+    new = work / final.name
     try:
-        data = work / "data.img"
-        data_extents = card.data_partition(made.tools, data, identity.nodes(fleet, robot), made.lock.epoch)
-        new = work / final.name
-        extents = card.image(made.base, data, data_extents, new)
-        with new.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        bmap.write_bmap(new, extents, work / f"{robot.name}.bmap")
-        (work / f"{robot.name}.sha256").write_text(f"{digest}  {final.name}\n")
-        data.unlink()
+        with ThreadPoolExecutor() as threads:
+            extents = card.begin(made.base, new)
+            beginning = threads.submit(manifest.hash_range, new, 0, card.DATA.start)
+            source = threads.submit(manifest.checkout)
+            nodes = identity.nodes(fleet, robot)
+            data = work / "data.img"
+            extents += card.complete(new, data, card.data_partition(made.tools, data, nodes, made.lock.epoch))
+            data.unlink()
+            mapping = threads.submit(bmap.write_bmap, new, extents, bmap.bmap_of(new))
+            data_part = manifest.part("data partition", new, card.DATA.start, card.DATA.size)
+            whole = manifest.hash_range(new, card.DATA.start, card.DATA.size, beginning.result()).hexdigest()
+            manifest.write(
+                fleet, robot, (made.lock, made.tools_lock), made.manifest, nodes=nodes, source=source.result(),
+                data=data_part, image=manifest.Part(name=final.name, bytes=card.SIZE, sha256=whole), extents=extents,
+                beside=new,
+            )  # fmt: skip
+            mapped = mapping.result().mapped
+        new.with_suffix(".sha256").write_text(f"{whole}  {final.name}\n")
         for made_file in sorted(work.iterdir()):
             made_file.rename(paths.IMAGES / made_file.name)
     finally:
         cache.discard(work)
-    mapped = sum(length for _, length in extents)
     print(
-        f"{paths.shown(final)}: {progress.size(card.SIZE)}, {progress.size(mapped)} to write, sha256 {digest[:16]}…, "
+        f"{paths.shown(final)}: {progress.size(card.SIZE)}, {progress.size(mapped)} to write, sha256 {whole[:16]}…, "
         f"{time.monotonic() - started:.1f} s"
     )
     return final

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from images.builder import paths
+from images.builder import host, paths
 
 
 def digest(*parts: str | bytes | Path) -> str:
@@ -45,7 +45,8 @@ def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
         discard(beside)
         beside.mkdir(parents=True)
         try:
-            make(beside)
+            with host.explaining_a_full_disk():
+                make(beside)
             beside.rename(final)
         finally:
             discard(beside)

@@ -1,6 +1,7 @@
-"""The card: MBR, GRUB, boot partition, root slots A and B, data partition. Made as a file, with neither loop device nor mount.
+"""The card: MBR, GRUB, boot partition, root slots A and B, data partition. A file, made without loop device or mount.
 
-All cards of a board are the same up to the data partition: `base` makes that part once, `image` adds a robot's data.
+All cards of a board are the same up to the data partition: `base` makes that part once, `begin` copies it, `complete`
+adds a robot's data.
 
 | bytes from the start | what |
 |---|---|
@@ -19,8 +20,6 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-
-import jinja2
 
 from images.builder import cache, filesystem, paths
 from images.builder.errors import UserError
@@ -85,7 +84,7 @@ def base(board: Board, root: Path, tools: Tools, epoch: int) -> Path:
                 "leave out packages in images/packages/ or files in images/rootfs/exclude.list"
             )
         boot = out / "boot.img"
-        extents = filesystem.make(
+        boot_extents = filesystem.make(
             tools, boot, BOOT.size, _boot_nodes(board, root, template), kind="ext2", label="boot", uuid=_UUIDS["boot"],
             epoch=epoch,
         )  # fmt: skip
@@ -96,7 +95,7 @@ def base(board: Board, root: Path, tools: Tools, epoch: int) -> Path:
             card.seek(512)
             card.write(core)
             copied = [(0, 512 + len(core))]
-            copied += _place(boot, extents, card.fileno(), BOOT)
+            copied += _place(boot, boot_extents, card.fileno(), BOOT)
             copied += _place(squashfs, [(0, squashfs.stat().st_size)], card.fileno(), SLOTS[0])
         (out / "extents.json").write_text(json.dumps(copied))
         boot.unlink()
@@ -104,14 +103,23 @@ def base(board: Board, root: Path, tools: Tools, epoch: int) -> Path:
     return cache.result("card", key, make)
 
 
-def image(base_directory: Path, data: Path, data_extents: Extents, out: Path) -> Extents:
-    """Write the card `out`: the board's base and the robot's data partition. Only what holds anything is written."""
-    extents = [(start, length) for start, length in json.loads((base_directory / "extents.json").read_text())]
+def extents(base_directory: Path) -> Extents:
+    """Where the board's part of a card holds anything: what comes before the first partition, then the partitions."""
+    return [(start, length) for start, length in json.loads((base_directory / "extents.json").read_text())]
+
+
+def begin(base_directory: Path, out: Path) -> Extents:
+    """Write the card `out` up to the robot's data partition. Only what holds anything is written."""
     whole = Partition(0, "card", 0, SIZE)
     with out.open("wb") as card:
         card.truncate(SIZE)
-        _place(base_directory / "card.img", extents, card.fileno(), whole)
-        return extents + _place(data, data_extents, card.fileno(), DATA)
+        return _place(base_directory / "card.img", extents(base_directory), card.fileno(), whole)
+
+
+def complete(card: Path, data: Path, data_extents: Extents) -> Extents:
+    """Add the robot's data partition to a card that `begin` made."""
+    with card.open("r+b") as file:
+        return _place(data, data_extents, file.fileno(), DATA)
 
 
 def data_partition(tools: Tools, out: Path, nodes: list[Node], epoch: int) -> Extents:
@@ -133,8 +141,14 @@ def _place(source: Path, extents: Extents, card: int, partition: Partition) -> E
 
 
 def _boot_nodes(board: Board, root: Path, template: Path) -> list[Node]:
+    import jinja2  # here, because the next robot's card does not need it
+
     environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
     )
     arguments = kernel_arguments(board)
     config = environment.from_string(template.read_text()).render(board=board, slots=SLOTS, kernel_arguments=arguments)
@@ -155,7 +169,16 @@ def _core(tools: Tools, out: Path) -> bytes:
     core = out / "core.img"
     modules = tools.directory / "usr/lib/grub/i386-pc"
     tools.run(
-        "usr/bin/grub-mkimage", "-O", "i386-pc", "-d", modules, "-p", "(,msdos1)/grub", "-o", core, *_GRUB_MODULES.split()
+        "usr/bin/grub-mkimage",
+        "-O",
+        "i386-pc",
+        "-d",
+        modules,
+        "-p",
+        "(,msdos1)/grub",
+        "-o",
+        core,
+        *_GRUB_MODULES.split(),
     )
     content = core.read_bytes()
     core.unlink()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from images.builder import paths, progress
@@ -23,6 +25,8 @@ _USER_COMMANDS = {"newuidmap": "uidmap", "newgidmap": "uidmap"}
 """What ordinary users need besides, to map the users of the image."""
 _SPACE = 1 << 30
 """Bytes of disk for the pool, one board's results and an image."""
+_FULL = 16 << 20
+"""Bytes below which a disk counts as full: files are larger than this."""
 _MEMORY = 1 << 30
 """Bytes of memory for the root file system while it is made."""
 
@@ -67,3 +71,17 @@ def _missing_memory(meminfo: Path = Path("/proc/meminfo")) -> list[str]:
         f"{progress.size(available)} of memory available, a build needs {progress.size(_MEMORY)}: the root file system "
         "is made in memory; close other programs, or add swap"
     ]
+
+
+@contextlib.contextmanager
+def explaining_a_full_disk() -> Iterator[None]:
+    """Whatever way a full disk made a step fail, say that it was the disk."""
+    try:
+        yield
+    except (UserError, OSError) as error:
+        if shutil.disk_usage(paths.BUILD).free > _FULL:
+            raise
+        raise UserError(
+            f"{paths.shown(paths.BUILD)}: no space left on its disk, so the build failed; the last good images are "
+            f"untouched; make room, or choose another place with BUILD=directory ({str(error).splitlines()[0]})"
+        ) from error

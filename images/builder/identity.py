@@ -11,13 +11,15 @@ import hashlib
 import os
 import subprocess
 from pathlib import Path, PurePosixPath
-
-import jinja2
+from typing import TYPE_CHECKING
 
 from images.builder import paths
 from images.builder.errors import UserError
 from images.builder.filesystem import Node
 from images.builder.fleet import Fleet, Host, Robot
+
+if TYPE_CHECKING:
+    import jinja2
 
 _PRIVATE = {"ssh_host_ed25519_key.j2": 0o600}
 """Modes of templates whose result is not for everyone."""
@@ -73,7 +75,7 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "robot": robot,
         "board": board,
         "hosts": hosts(fleet),
-        "interface": board.network_interface if fleet.network.link == "ethernet" else "wlan0",
+        "interface": fleet.interface(robot),
         # DDSI-RTPS 2.1, 9.6.1: ports of a domain, up to the participant index that discovery asks for.
         "dds_ports": f"{first}-{first + 249}",
         "host_keys": keys,
@@ -87,6 +89,8 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
 
 @functools.cache
 def _environment() -> jinja2.Environment:
+    import jinja2  # here, because it takes a while, in which the build has other things to do
+
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(paths.OVERLAY),
         undefined=jinja2.StrictUndefined,
@@ -99,6 +103,8 @@ def _environment() -> jinja2.Environment:
 
 def render(fleet: Fleet, robot: Robot) -> dict[PurePosixPath, tuple[bytes, int]]:
     """The robot's files by path on the robot: content and mode. An empty result means no file."""
+    import jinja2
+
     values = variables(fleet, robot)
     files = {}
     for template in sorted(paths.OVERLAY.rglob("*.j2")):
@@ -119,7 +125,9 @@ def nodes(fleet: Fleet, robot: Robot) -> list[Node]:
     directories = {PurePosixPath("/", top) for top in tops}
     for path in files:
         if path.parts[1] != "etc":
-            raise UserError(f"rootfs_overlay{path}.j2: templates lie below etc/: the rest of the root is common to all robots")
+            raise UserError(
+                f"rootfs_overlay{path}.j2: templates lie below etc/: the rest of the root is common to all robots"
+            )
         directories |= {parent for parent in path.parents if parent != PurePosixPath("/")}
     made = [Node(path) for path in directories] + [Node(path, content, mode) for path, (content, mode) in files.items()]
     return sorted(made, key=lambda node: node.path.parts)

@@ -1,5 +1,4 @@
-"""The initramfs: busybox, the kernel modules that reach the card, and `init`. Nothing that detects or configures.
-"""
+"""The initramfs: busybox, the kernel modules that reach the card, and `init`. Nothing that detects or configures."""
 
 from __future__ import annotations
 

@@ -41,10 +41,14 @@ class Step:
 
 @contextmanager
 def step(title: str) -> Iterator[Step]:
-    """Show `title` while the body runs and its duration once it is done."""
+    """Show `title` while the body runs and its duration once it is done, or has failed."""
     handle = Step(title)
     _line(f"{title} …", keep=False)
-    yield handle
+    try:
+        yield handle
+    except BaseException:
+        _line(f"{title}: failed after {time.monotonic() - handle.started:.1f} s", keep=True)
+        raise
     _line(f"{title}: {time.monotonic() - handle.started:.1f} s", keep=True)
 
 

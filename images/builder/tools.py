@@ -22,15 +22,18 @@ def tree(lock: Lock) -> Path:
     """The tools of `lock`, unpacked once."""
 
     def unpack(directory: Path) -> None:
+        pool.verify_hashes(lock)
         with progress.step(f"unpack {len(lock.packages)} build tools") as step:
             for name in _MERGED:
                 (directory / "usr" / name).mkdir(parents=True)
                 (directory / name).symlink_to(f"usr/{name}")
             for done, package in enumerate(lock.packages):
-                archive = subprocess.Popen(["dpkg-deb", "--fsys-tarfile", pool.file(package)], stdout=subprocess.PIPE)
+                pack = ["dpkg-deb", "--fsys-tarfile", str(pool.file(package))]
                 extract = ["tar", "-x", "--keep-directory-symlink", "--no-same-owner", "-C", str(directory)]
-                unpacked = subprocess.run([*extract, "--exclude=./usr/share/doc", "--exclude=./usr/share/man"], stdin=archive.stdout)
-                if archive.wait() != 0 or unpacked.returncode != 0:
+                extract += ["--exclude=./usr/share/doc", "--exclude=./usr/share/man"]
+                with subprocess.Popen(pack, stdout=subprocess.PIPE) as archive:
+                    unpacked = subprocess.run(extract, stdin=archive.stdout)
+                if archive.returncode != 0 or unpacked.returncode != 0:
                     raise UserError(f"cannot unpack {package.name} {package.version} ({pool.file(package)})")
                 step.at(done + 1, len(lock.packages), "packages")
             for name in _MOUNT_POINTS:
@@ -61,7 +64,9 @@ class Tools:
         library = self.directory / "usr/lib/x86_64-linux-gnu"
         argv = [str(loader), "--library-path", str(library), str(self.directory / program), *map(str, arguments)]
         progress.command([program, *map(str, arguments)])
-        done = subprocess.run(argv, env=self._environment, input=stdin, capture_output=True, text=True)
+        done = subprocess.run(argv, env=self._environment, input=stdin, capture_output=True, encoding="utf-8")
         if done.returncode != 0:
-            raise UserError(f"{program} failed (status {done.returncode}): {done.stderr.strip() or done.stdout.strip()}")
+            raise UserError(
+                f"{program} failed (status {done.returncode}): {done.stderr.strip() or done.stdout.strip()}"
+            )
         return done.stdout

@@ -34,7 +34,8 @@ def test_robots_differ_where_they_should(fleet: Fleet) -> None:
     differing = {str(path) for path in three | four if three.get(path) != four.get(path)}
     assert differing == {
         "/etc/chrony/chrony.conf", "/etc/hostname", "/etc/machine-id", "/etc/ssh/ssh_host_ed25519_key",
-        "/etc/ssh/ssh_host_ed25519_key.pub", "/etc/systemd/network/10-fleet.network", "/etc/udev/rules.d/70-robot.rules",
+        "/etc/ssh/ssh_host_ed25519_key.pub", "/etc/systemd/network/10-fleet.network",
+        "/etc/udev/rules.d/70-robot.rules",
     }  # fmt: skip
 
 

@@ -1,0 +1,390 @@
+"""What an image is, said beside it: `robotN.manifest.json`, and bills of materials in SPDX and CycloneDX.
+
+All of it follows from the image's inputs, so the same inputs give the same bytes; only `source`, the state of the git
+checkout, is about where it was built, and nothing of it is in the image. What a board's robots share is made once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import uuid
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, JsonValue
+
+from images.builder import cache, card, mirror, paths
+from images.builder.errors import UserError
+from images.builder.filesystem import Node
+from images.builder.fleet import Board, Fleet, Robot
+from images.builder.lock import Lock
+from images.builder.tools import Tools
+
+FORMAT: Literal[1] = 1
+"""Rises when a reader of older manifests would misread a new one."""
+SBOMS = ("spdx.json", "cdx.json")
+"""Endings of the bills of materials: SPDX 2.3 and CycloneDX."""
+_DPKG_STATUS = "var/lib/dpkg/status"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Package(_Model):
+    """An installed Debian package, as dpkg on the robot knows it."""
+
+    name: str
+    version: str
+    architecture: str
+    source: str
+    source_version: str
+    installed_kib: int
+    """As the package declares it: before documentation, translations and unused kernel modules are left out."""
+
+
+class Part(_Model):
+    """Something an image consists of."""
+
+    name: str
+    bytes: int
+    sha256: str
+
+
+class Partition(_Model):
+    """One line of the partition table."""
+
+    number: int
+    name: str
+    partuuid: str
+    content: str
+    start: int
+    """Bytes from the start of the card."""
+    bytes: int
+    used: int
+    """Bytes that hold anything, the file system's own included."""
+
+
+class Suite(_Model):
+    archive: str
+    name: str
+    released: datetime
+
+
+class LockId(_Model):
+    name: str
+    sha256: str
+    suites: list[Suite]
+
+
+class Source(_Model):
+    """The git checkout that built the image."""
+
+    commit: str
+    dirty: bool
+    """Whether files differed from the commit."""
+
+
+class RobotId(_Model):
+    number: int
+    name: str
+    board: str
+
+
+class Shared(_Model):
+    """What the manifests of a board's robots have in common."""
+
+    kernel: str
+    parts: list[Part]
+    packages: list[Package]
+
+
+class Manifest(_Model):
+    format: Literal[1]
+    robot: RobotId
+    architecture: str
+    kernel: str
+    """Version."""
+    lock: LockId
+    tools: LockId
+    """The lock of the build tools."""
+    epoch: int
+    """Seconds since 1970: every time inside the image."""
+    inputs: str
+    """SHA-256 over all that goes into the image. Equal inputs: equal image."""
+    source: Source | None
+    """None where there is no git."""
+    image: Part
+    parts: list[Part]
+    partitions: list[Partition]
+    packages: list[Package]
+    hostvars: dict[str, JsonValue]
+    """The robot's merged inventory variables, as the fleet model says them."""
+
+
+def file_of(image: Path) -> Path:
+    """Where the manifest of an image lies."""
+    return image.with_suffix(".manifest.json")
+
+
+def read(image: Path, remedy: str) -> Manifest:
+    """The manifest beside an image."""
+    path = file_of(image)
+    try:
+        return Manifest.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        raise UserError(f"{paths.shown(path)} is missing; `{remedy}`") from None
+    except ValueError as error:
+        raise UserError(f"{paths.shown(path)}: not a manifest of format {FORMAT}; `{remedy}`") from error
+
+
+# --- once per board ---
+
+
+def shared(board: Board, lock: Lock, root: Path, base: Path, tools: Tools) -> Path:
+    """Directory with `shared.json` and the bills of materials of a board's robots."""
+    key = cache.digest(
+        board.name, lock.digest, root.name, base.name, tools.directory.name, paths.PROJECT / "requirements.lock",
+        Path(__file__),
+    )  # fmt: skip
+
+    def make(out: Path) -> None:
+        status = tools.run("usr/bin/unsquashfs", "-cat", root / "root.squashfs", _DPKG_STATUS)
+        made = Shared(
+            kernel=json.loads((root / "contents.json").read_text())["kernel"],
+            parts=board_parts(root, base),
+            packages=packages(status),
+        )
+        installed = {(package.name, package.version) for package in made.packages}
+        locked = {(package.name, package.version) for package in lock.packages}
+        if installed != locked:  # a defect of the builder, not the user's
+            raise RuntimeError(f"installed and locked packages differ: {sorted(installed ^ locked)}")
+        (out / "shared.json").write_text(made.model_dump_json())
+        sboms(board.name, lock, status, out)
+
+    return cache.result("manifest", key, make)
+
+
+def board_parts(root: Path, base: Path) -> list[Part]:
+    """What all cards of a board have in common, piece by piece."""
+    start = card.extents(base)[0]
+    regions = {"mbr+grub": start, "boot partition": (card.BOOT.start, card.BOOT.size)}
+    parts = [part(name, base / "card.img", *region) for name, region in regions.items()]
+    files = ("vmlinuz", "initrd.img", "root.squashfs")
+    return parts + [part(name, root / name, 0, (root / name).stat().st_size) for name in files]
+
+
+def packages(status: str) -> list[Package]:
+    """The packages of a dpkg status file by name."""
+    found = []
+    for fields in mirror.stanzas(status):
+        name, version = fields["Package"], fields["Version"]
+        source = re.fullmatch(r"(\S+)(?: \((.+)\))?", fields.get("Source", name))
+        assert source
+        found.append(
+            Package(
+                name=name,
+                version=version,
+                architecture=fields["Architecture"],
+                source=source[1],
+                source_version=source[2] or version,
+                installed_kib=int(fields.get("Installed-Size", 0)),
+            )
+        )
+    return sorted(found, key=lambda package: package.name)
+
+
+def sboms(board: str, lock: Lock, status: str, out: Path) -> None:
+    """Write `sbom.spdx.json` and `sbom.cdx.json` about the packages of a dpkg status file.
+
+    debsbom reads a root directory: the status, and for the packages' hashes an index as apt keeps it.
+    """
+    hashes = {package.name: package.sha256 for package in lock.packages}
+    root = out / "root"
+    apt = root / "var/lib/apt/lists"
+    apt.mkdir(parents=True)
+    (root / _DPKG_STATUS).parent.mkdir(parents=True)
+    (root / _DPKG_STATUS).write_text(status, encoding="utf-8")
+    index = [
+        f"Package: {fields['Package']}\nVersion: {fields['Version']}\nArchitecture: {fields['Architecture']}\n"
+        f"Maintainer: {fields.get('Maintainer', '')}\nSHA256: {hashes[fields['Package']]}\n\n"
+        for fields in mirror.stanzas(status)
+        if fields["Package"] in hashes
+    ]
+    suite = lock.suites[0]
+    (apt / "flotilla_Release").write_text(
+        f"Origin: Debian\nCodename: {suite.name}\nArchitectures: {lock.architecture}\nComponents: main\n"
+    )
+    (apt / f"flotilla_main_binary-{lock.architecture}_Packages").write_text("".join(index), encoding="utf-8")
+    content = hashlib.sha256(status.encode()).hexdigest()
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, f"flotilla {board} {lock.digest} {content}")
+    program = Path(sys.executable).with_name("debsbom")
+    argv = [
+        str(program), "generate", "--root", str(root), "--out", str(out / "made"), "--distro-arch", lock.architecture,
+        "--distro-name", f"flotilla-{board}", "--distro-version", lock.digest[:16],
+        "--timestamp", datetime.fromtimestamp(lock.epoch, UTC).isoformat(),
+        "--cdx-serialnumber", str(identity), "--spdx-namespace", f"urn:uuid:{identity}",
+    ]  # fmt: skip
+    environment = {"PATH": os.environ.get("PATH", ""), "LC_ALL": "C.UTF-8", "TZ": "UTC", "PYTHONHASHSEED": "0"}
+    try:
+        done = subprocess.run(argv, env=environment, capture_output=True, text=True, encoding="utf-8", check=False)
+    except FileNotFoundError:
+        raise UserError(f"{program}: not installed; run `make setup`") from None
+    if done.returncode:
+        raise UserError(f"debsbom failed (status {done.returncode}): {done.stderr.strip()}")
+    for ending in SBOMS:
+        made = out / f"made.{ending}"
+        document = _sorted(json.loads(made.read_text(encoding="utf-8")))
+        text = json.dumps(document, indent=1, ensure_ascii=False, sort_keys=True)
+        (out / f"sbom.{ending}").write_text(text + "\n", encoding="utf-8")
+        made.unlink()
+    shutil.rmtree(root)
+
+
+def _sorted(value: Any) -> Any:
+    """The document with its lists in order: debsbom writes them as a set's hashes fall."""
+    if isinstance(value, dict):
+        return {key: _sorted(content) for key, content in value.items()}
+    if isinstance(value, list):
+        return sorted(map(_sorted, value), key=lambda item: json.dumps(item, sort_keys=True))
+    return value
+
+
+# --- per robot ---
+
+
+def write(
+    fleet: Fleet,
+    robot: Robot,
+    locks: tuple[Lock, Lock],
+    common: Path,
+    *,
+    nodes: list[Node],
+    source: Source | None,
+    data: Part,
+    image: Part,
+    extents: card.Extents,
+    beside: Path,
+) -> None:
+    """Write the manifest and the bills of materials of `beside`, an image of which everything is known.
+
+    `locks`: the board's and the build tools'. `common`: what `shared` made.
+    """
+    board = fleet.boards[robot.board]
+    lock, tools_lock = locks
+    same = Shared.model_validate_json((common / "shared.json").read_bytes())
+    manifest = Manifest(
+        format=FORMAT,
+        robot=RobotId(number=robot.number, name=robot.name, board=robot.board),
+        architecture=board.architecture,
+        kernel=same.kernel,
+        lock=_lock_id(lock),
+        tools=_lock_id(tools_lock),
+        epoch=lock.epoch,
+        inputs=inputs(board, locks, nodes),
+        source=source,
+        image=image,
+        parts=[*same.parts, data],
+        partitions=partitions(extents),
+        packages=same.packages,
+        hostvars=hostvars(fleet, robot),
+    )
+    file_of(beside).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    for ending in SBOMS:
+        shutil.copyfile(common / f"sbom.{ending}", beside.with_suffix(f".{ending}"))
+
+
+def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
+    """One hash over all that goes into a robot's image: rather too much (all of the builder) than too little."""
+    images = paths.PROJECT / "images"
+    identity = [
+        part
+        for node in nodes
+        for part in (f"{node.path} {node.mode:o} {node.uid} {node.gid}", node.content or b"", str(node.content is None))
+    ]
+    return cache.digest(
+        *(lock.digest for lock in locks), paths.OVERLAY, images / "rootfs", images / "builder", images / "grub.cfg.j2",
+        paths.PROJECT / "requirements.lock", board.model_dump_json(), *identity,
+    )  # fmt: skip
+
+
+def partitions(extents: card.Extents) -> list[Partition]:
+    """The partition table, with how much of each partition the extents of a card fill."""
+    contents = {"boot": "ext2", "A": "squashfs", "B": "empty", "data": "ext4"}
+    return [
+        Partition(
+            number=partition.number,
+            name=partition.name,
+            partuuid=partition.partuuid,
+            content=contents[partition.name],
+            start=partition.start,
+            bytes=partition.size,
+            used=sum(
+                length for start, length in extents if partition.start <= start < partition.start + partition.size
+            ),
+        )
+        for partition in (card.BOOT, *card.SLOTS, card.DATA)
+    ]
+
+
+def hostvars(fleet: Fleet, robot: Robot) -> dict[str, JsonValue]:
+    """The robot's variables as the fleet model says them, with those it shares."""
+    own: dict[str, JsonValue] = robot.model_dump(mode="json", exclude={"board"})
+    shared: dict[str, JsonValue] = {
+        "fleet_name": fleet.name,
+        "network": fleet.network.model_dump(mode="json"),
+        "interface": fleet.interface(robot),
+        "board": fleet.boards[robot.board].model_dump(mode="json"),
+    }
+    return own | shared
+
+
+def checkout(directory: Path = paths.PROJECT) -> Source | None:
+    """Commit and cleanliness of the checkout that `directory` is the top of; None without git, or outside of it."""
+    try:
+        top, commit = _git(directory, "rev-parse", "--show-toplevel", "HEAD").splitlines()
+        if Path(top).resolve() != directory.resolve():  # unpacked inside somebody else's repository
+            return None
+        return Source(commit=commit, dirty=bool(_git(directory, "status", "--porcelain")))
+    except (OSError, ValueError, subprocess.CalledProcessError):
+        return None
+
+
+def _git(directory: Path, *arguments: str) -> str:
+    # Nothing may be written: another user may own the checkout, and another git may be at work in it.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    argv = ["git", "-C", str(directory), *arguments]
+    environment |= {"GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C.UTF-8"}
+    return subprocess.run(argv, env=environment, capture_output=True, text=True, check=True).stdout
+
+
+def _lock_id(lock: Lock) -> LockId:
+    suites = [Suite(archive=suite.archive, name=suite.name, released=suite.date) for suite in lock.suites]
+    return LockId(name=lock.name, sha256=lock.digest, suites=suites)
+
+
+def part(name: str, file: Path, start: int, length: int) -> Part:
+    """A range of a file as part of an image."""
+    return Part(name=name, bytes=length, sha256=hash_range(file, start, length).hexdigest())
+
+
+def hash_range(file: Path, start: int, length: int, before: hashlib._Hash | None = None) -> hashlib._Hash:
+    """SHA-256 over a range of a file, going on from what came `before`. Lets other threads work meanwhile."""
+    total = before or hashlib.sha256()
+    buffer = memoryview(bytearray(1 << 20))
+    with file.open("rb", buffering=0) as content:
+        content.seek(start)
+        while length:
+            count = content.readinto(buffer[: min(length, len(buffer))])
+            if not count:
+                raise EOFError(f"{file} ends {length} bytes early")
+            total.update(buffer[:count])
+            length -= count
+    return total

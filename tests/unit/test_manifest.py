@@ -1,0 +1,245 @@
+"""The manifest and the bills of materials: what they say, and that the same inputs give the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+from images.builder import card, inventory, manifest
+from images.builder.errors import UserError
+from images.builder.filesystem import Node
+from images.builder.fleet import Fleet
+from images.builder.lock import Lock, Package, Suite, read_lock
+
+STATUS = """Package: libone
+Status: install ok installed
+Architecture: i386
+Source: one (1.2)
+Version: 1.2+b1
+Installed-Size: 40
+Maintainer: A Developer <a@example.org>
+Description: first
+ Written by hand.
+
+Package: beta
+Status: install ok installed
+Architecture: all
+Version: 2:3-1
+Maintainer: A Developer <a@example.org>
+Depends: libone
+Description: second
+
+Package: gamma
+Status: install ok installed
+Architecture: i386
+Source: one
+Version: 1.2
+Installed-Size: 7
+Maintainer: A Developer <a@example.org>
+Description: third
+"""
+
+
+def locked(name: str, version: str, sha256: str) -> Package:
+    return Package(name, version, "i386", "userland", "debian", 1, sha256, f"pool/{name}.deb")
+
+
+LOCK = Lock(
+    "board",
+    "i386",
+    (Suite("debian", "bookworm", datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)),),
+    (locked("beta", "2:3-1", "b" * 64), locked("gamma", "1.2", "c" * 64), locked("libone", "1.2+b1", "a" * 64)),
+)
+NODES = [Node(PurePosixPath("/etc")), Node(PurePosixPath("/etc/hostname"), b"robot3\n", 0o644)]
+
+
+@pytest.fixture(scope="module")
+def fleet() -> Fleet:
+    return inventory.load_fleet()
+
+
+# --- packages and bills of materials ---
+
+
+def test_packages_have_their_sources() -> None:
+    assert [(package.name, package.source, package.source_version) for package in manifest.packages(STATUS)] == [
+        ("beta", "beta", "2:3-1"),
+        ("gamma", "one", "1.2"),
+        ("libone", "one", "1.2"),
+    ]
+    assert [package.installed_kib for package in manifest.packages(STATUS)] == [0, 7, 40]
+
+
+def sboms(status: str, out: Path) -> dict[str, bytes]:
+    out.mkdir()
+    manifest.sboms("board", LOCK, status, out)
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+def test_bills_of_materials(tmp_path: Path) -> None:
+    made = sboms(STATUS, tmp_path / "one")
+    assert sorted(made) == ["sbom.cdx.json", "sbom.spdx.json"]
+    assert made == sboms(STATUS, tmp_path / "elsewhere")
+    spdx, cdx = json.loads(made["sbom.spdx.json"]), json.loads(made["sbom.cdx.json"])
+    assert {"beta", "gamma", "libone"} <= {package["name"] for package in spdx["packages"]}
+    assert {"beta", "gamma", "libone"} <= {component["name"] for component in cdx["components"]}
+    assert spdx["creationInfo"]["created"] == "2026-01-02T03:04:05Z"
+    assert cdx["metadata"]["timestamp"].startswith("2026-01-02T03:04:05")
+    checksums = {package["name"]: package["checksums"] for package in spdx["packages"] if "checksums" in package}
+    assert checksums["libone"] == [{"algorithm": "SHA256", "checksumValue": "a" * 64}]
+    assert str(tmp_path).encode() not in b"".join(made.values())
+
+    other = json.loads(sboms(STATUS.replace("Version: 1.2\n", "Version: 1.3\n"), tmp_path / "other")["sbom.cdx.json"])
+    assert other["serialNumber"] != cdx["serialNumber"]
+
+
+def test_order_of_lists_does_not_matter() -> None:
+    one, two = {"b": 1, "a": ["x", {"k": [2, 1]}]}, {"a": [{"k": [1, 2]}, "x"], "b": 1}
+    assert json.dumps(manifest._sorted(one)["a"]) == json.dumps(manifest._sorted(two)["a"])
+    assert manifest._sorted(one) != manifest._sorted({"a": ["x", {"k": [1, 3]}], "b": 1})
+
+
+# --- hashes ---
+
+
+def test_hash_of_ranges(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 9000
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    assert manifest.hash_range(file, 100, 2_000_000).digest() == hashlib.sha256(content[100:2_000_100]).digest()
+    beginning = manifest.hash_range(file, 0, 1_500_000)
+    whole = manifest.hash_range(file, 1_500_000, len(content) - 1_500_000, beginning)
+    assert whole.digest() == hashlib.sha256(content).digest()
+    with pytest.raises(EOFError):
+        manifest.hash_range(file, 0, len(content) + 1)
+
+
+def test_inputs_follow_everything(fleet: Fleet) -> None:
+    board, locks = fleet.boards["smartcoret3"], (LOCK, LOCK)
+    same = manifest.inputs(board, locks, NODES)
+    assert same == manifest.inputs(board, locks, list(NODES))
+    hostname = NODES[1]
+    others = [
+        manifest.inputs(fleet.boards["x86_64"], locks, NODES),
+        manifest.inputs(board, (LOCK, replace(LOCK, packages=LOCK.packages[1:])), NODES),
+        manifest.inputs(board, locks, NODES[:1]),
+        manifest.inputs(board, locks, [NODES[0], replace(hostname, content=b"robot4\n")]),
+        manifest.inputs(board, locks, [NODES[0], replace(hostname, content=b"")]),
+        manifest.inputs(board, locks, [NODES[0], replace(hostname, content=None)]),
+        manifest.inputs(board, locks, [NODES[0], replace(hostname, mode=0o600)]),
+        manifest.inputs(board, locks, [NODES[0], replace(hostname, uid=1000)]),
+    ]
+    assert len({same, *others}) == 1 + len(others)
+
+
+# --- git ---
+
+
+def git(directory: Path, *arguments: str) -> str:
+    author = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
+    argv = ["git", "-C", str(directory), *author, *arguments]
+    return subprocess.run(argv, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def test_checkout(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "file").write_text("1")
+    assert manifest.checkout(project) is None
+    git(project, "init", "-q")
+    assert manifest.checkout(project) is None, "no commit yet"
+    git(project, "add", "file")
+    git(project, "commit", "-qm", "first")
+    clean = manifest.checkout(project)
+    assert clean == manifest.Source(commit=git(project, "rev-parse", "HEAD"), dirty=False)
+    (project / "file").write_text("2")
+    dirty = manifest.checkout(project)
+    assert dirty == manifest.Source(commit=clean.commit, dirty=True)
+    (project / "inside").mkdir()
+    assert manifest.checkout(project / "inside") is None, "another project's repository"
+
+
+def test_no_git_no_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert manifest.checkout() is None
+
+
+# --- the whole ---
+
+
+EXTENTS = [
+    (0, 512 + 1000),
+    (card.BOOT.start, 4096),
+    (card.BOOT.start + 8192, 4096),
+    (card.SLOTS[0].start, 5),
+    (card.DATA.start, 9),
+]
+
+
+def written(fleet: Fleet, directory: Path, number: int = 3, source: manifest.Source | None = None) -> Path:
+    common = directory / "common"
+    common.mkdir(parents=True)
+    same = manifest.Shared(
+        kernel="6.1.0", parts=[manifest.Part(name="vmlinuz", bytes=1, sha256="0")], packages=manifest.packages(STATUS)
+    )
+    (common / "shared.json").write_text(same.model_dump_json())
+    for ending in manifest.SBOMS:
+        (common / f"sbom.{ending}").write_text(ending)
+    image = directory / f"robot{number}.img"
+    manifest.write(
+        fleet, fleet.robots[number], (read_lock("smartcoret3"), read_lock("tools")), common, nodes=NODES, source=source,
+        data=manifest.Part(name="data partition", bytes=9, sha256="1"),
+        image=manifest.Part(name=image.name, bytes=card.SIZE, sha256="2"), extents=EXTENTS, beside=image,
+    )  # fmt: skip
+    return image
+
+
+def test_manifest(fleet: Fleet, tmp_path: Path) -> None:
+    image = written(fleet, tmp_path)
+    made = manifest.read(image, "make image")
+    assert made.robot == manifest.RobotId(number=3, name="robot3", board="smartcoret3")
+    assert made.lock.sha256 == read_lock("smartcoret3").digest
+    assert made.hostvars["interface"] == fleet.interface(fleet.robots[3])
+    assert made.hostvars["address"] == str(fleet.robots[3].address)
+    assert [part.name for part in made.parts] == ["vmlinuz", "data partition"]
+    assert {partition.name: partition.used for partition in made.partitions} == {
+        "boot": 8192,
+        "A": 5,
+        "B": 0,
+        "data": 9,
+    }
+    assert (tmp_path / "robot3.spdx.json").read_text() == "spdx.json"
+    assert (tmp_path / "robot3.cdx.json").read_text() == "cdx.json"
+
+
+def test_same_inputs_same_bytes(fleet: Fleet, tmp_path: Path) -> None:
+    one = manifest.file_of(written(fleet, tmp_path / "one")).read_bytes()
+    assert one == manifest.file_of(written(fleet, tmp_path / "two")).read_bytes()
+    assert one != manifest.file_of(written(fleet, tmp_path / "other", number=4)).read_bytes()
+    source = manifest.Source(commit="0" * 40, dirty=False)
+    assert one != manifest.file_of(written(fleet, tmp_path / "git", source=source)).read_bytes()
+    assert str(tmp_path).encode() not in one
+
+
+def test_no_private_key_in_the_manifest(fleet: Fleet, tmp_path: Path) -> None:
+    text = manifest.file_of(written(fleet, tmp_path)).read_text()
+    assert "PRIVATE" not in text
+    assert "robot3" in text
+
+
+def test_missing_and_foreign_manifests(fleet: Fleet, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is missing; `make image ROBOT=3`"):
+        manifest.read(tmp_path / "robot3.img", "make image ROBOT=3")
+    image = written(fleet, tmp_path)
+    path = manifest.file_of(image)
+    text = path.read_text()
+    for old, new in (('"format": 1', '"format": 2'), ('"epoch"', '"other"'), ("{", "")):
+        path.write_text(text.replace(old, new, 1))
+        with pytest.raises(UserError, match="not a manifest of format 1; `make image`"):
+            manifest.read(image, "make image")
