@@ -60,7 +60,7 @@ test: | setup-tests ## everything: checks, images, boots in QEMU
 	$(Q)$(VENV)/bin/pytest tests
 
 bench: | setup-tests ## wall times and ratios against other builders
-	$(Q)$(FLOTILLA) bench
+	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
 
 ##@ Housekeeping
 .PHONY: setup setup-tests clean help

@@ -57,6 +57,14 @@ def _size(arguments: argparse.Namespace) -> None:
     print(size.report(build.image_of(robot), remedy=f"make image ROBOT={robot.number}"))
 
 
+def _bench(arguments: argparse.Namespace) -> None:
+    from images.builder import bench, inventory
+
+    fleet = inventory.load_fleet()
+    robot = next(iter(fleet.robots)) if arguments.robot is None else arguments.robot
+    print(bench.bench(fleet, inventory.robot(fleet, robot)))
+
+
 def _lock(_: argparse.Namespace) -> None:
     from images.builder import lock
 
@@ -76,6 +84,7 @@ _COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
     "ssh": (_ssh, "shell on a robot"),
     "size": (_size, "what takes the room of an image"),
     "verify": (_verify, "build a second time under other circumstances and compare"),
+    "bench": (_bench, "wall times and ratios against other builders"),
     "lock": (_lock, "resolve the package lists"),
     "check-fleet": (_check_fleet, "validate the inventory"),
 }
@@ -85,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m images.builder", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
-    for name in ("image", "flash", "boot", "ssh", "size", "verify"):
+    for name in ("image", "flash", "boot", "ssh", "size", "verify", "bench"):
         made[name].add_argument("--robot", type=int, help="number in the inventory")
     made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
     made["verify"].add_argument("--plant", action="store_true", help="plant a difference, which must be found")

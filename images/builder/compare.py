@@ -163,7 +163,10 @@ def squashfs_listing(listing: str, work: Path) -> dict[str, Entry]:
         if match := re.fullmatch(r"(\S+ +\d+/\d+ .*\d{4}-\d\d-\d\d \d\d:\d\d) squashfs-root(.*)", line):
             name, _, target = match[2].partition(" -> ")
             content = work / name.removeprefix("/") if line.startswith("-") else None
-            entries[name or "/"] = Entry(" ".join((*match[1].split(), *([f"-> {target}"] if target else []))), content)
+            words = match[1].split()
+            if line.startswith("d"):
+                del words[2]  # the size of a directory in squashfs tells where others lie
+            entries[name or "/"] = Entry(" ".join((*words, *([f"-> {target}"] if target else []))), content)
     return entries
 
 

@@ -45,7 +45,7 @@ def _refusal(stderr: str) -> UserError:
 
 
 def prefix(*more: str, root: bool | None = None) -> list[str]:
-    """The command that puts what follows it into namespaces; the same for root and for ordinary users but the mapping.
+    """The command that puts what follows it into namespaces; for ordinary users with a mapping of users.
 
     `more` are further options of unshare(1); `root` says who runs the command, where that is somebody else.
     """

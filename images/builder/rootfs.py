@@ -193,7 +193,7 @@ def _bootstrap(stage: Stage, architecture: str, packages: list[str]) -> None:
         f"--include={include}", "bookworm", "/target", "file:///repository",
     )  # fmt: skip
     # Maintainer scripts look for configuration files, so those go afterwards (_remove_excluded), the rest never comes.
-    rules = [(keep, pattern) for keep, pattern in _path_rules() if not pattern.startswith("/etc/")]
+    rules = [(keep, pattern) for keep, pattern in path_rules() if not pattern.startswith("/etc/")]
     config = ["force-unsafe-io", *(f"path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rules)]
     (stage.target / "etc/dpkg/dpkg.cfg.d").mkdir(parents=True, exist_ok=True)
     (stage.target / "etc/dpkg/dpkg.cfg.d/flotilla").write_text("\n".join(config) + "\n")
@@ -205,7 +205,7 @@ def _list(name: str) -> list[str]:
     return [entry for line in (_DATA / name).read_text().splitlines() if (entry := line.split("#")[0].strip())]
 
 
-def _path_rules() -> list[tuple[bool, str]]:
+def path_rules() -> list[tuple[bool, str]]:
     """What to keep (True) or leave out, as shell patterns; the last that matches counts."""
     rules = []
     for entry in _list("exclude.list"):
@@ -218,7 +218,7 @@ def _path_rules() -> list[tuple[bool, str]]:
 
 def _remove_excluded(target: Path) -> None:
     """debootstrap unpacks the first packages without asking dpkg's rules, and dpkg exempts links."""
-    rules = [(keep, re.compile(fnmatch.translate(pattern))) for keep, pattern in _path_rules()]
+    rules = [(keep, re.compile(fnmatch.translate(pattern))) for keep, pattern in path_rules()]
     for parent, _, names in os.walk(target):
         place = "/" + os.path.relpath(parent, target) + "/"
         for name in names:

@@ -93,7 +93,7 @@ def verify(fleet: Fleet, robot: Robot, *, plant: bool = False) -> str:
             toolset = tools.Tools(tools.tree(read_lock("tools")), read_lock(board.name).epoch)
             found = compare.images(kept, second, toolset, directory)
         if found:
-            saved = paths.IMAGES / f"{robot.name}.second.img"
+            saved = paths.BUILD / f"verify-{robot.name}.img"
             shutil.copyfile(second, saved)
             raise UserError(
                 "\n  ".join([f"{robot.name}: the image built elsewhere differs from {paths.shown(first)}:", *found])

@@ -1,0 +1,160 @@
+"""How long images take, against a public builder on the same packages and against copying the same bytes.
+
+Everything runs as it would for a user: whole processes, from their start to their end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from images.builder import build, cache, paths, pool, progress, rootfs
+from images.builder.errors import UserError
+from images.builder.fleet import Fleet, Robot
+from images.builder.lock import SUITE, Lock, read_lock
+
+_PACKAGES = paths.PROJECT / "images" / "bench-packages.txt"
+_RUNS = 5
+"""Of what takes about a second; the median counts."""
+REPORT = paths.BUILD / "reports" / "bench.json"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement."""
+
+    work: str
+    made: str
+    """What it produced."""
+    seconds: float
+    bytes: int
+    """Of what it produced, holes not counted."""
+    runs: int
+
+
+def bench(fleet: Fleet, first: Robot) -> str:
+    """Measure, `first` being the robot that is built first, and return the table; also written to `REPORT`."""
+    others = [other for other in fleet.robots.values() if other.board == first.board and other != first]
+    others.sort(key=lambda other: (other.number < first.number, other.number))
+    lock = read_lock(first.board)
+    subprocess.run([paths.PROJECT / "images" / "install-host-packages", _PACKAGES], check=True)
+    pool.fill([lock, read_lock("tools")])
+    work = paths.BUILD / "bench"
+    cache.discard(work)
+    load = os.getloadavg()[0]
+    try:
+        rows = _ours(work, fleet, first, others)
+        rows.append(_mmdebstrap(work, lock))
+    finally:
+        cache.discard(work)
+    REPORT.parent.mkdir(parents=True, exist_ok=True)
+    report = {
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "load": load,
+        "rows": [asdict(row) for row in rows],
+    }
+    REPORT.write_text(json.dumps(report, indent=1) + "\n")
+    return f"{table(rows)}\n{os.cpu_count()} cores; load before: {load:.1f}"
+
+
+def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[Row]:
+    """Our own builds in `work`, from an empty cache on, and the copy of an image."""
+    work.mkdir(parents=True)
+    (work / "pool").symlink_to(paths.POOL)
+    images = work / "images"
+
+    def image(*robots: Robot) -> Callable[[], int]:
+        def make() -> int:
+            choice = ["--all"] if len(robots) == len(fleet.robots) else ["--robot", str(robots[0].number)]
+            _command([sys.executable, "-m", "images.builder", "image", *choice], BUILD=str(work), KEYS=str(paths.KEYS))
+            return sum(_allocated(images / build.image_of(robot).name) for robot in robots)
+
+        return make
+
+    rows = [
+        _measure(f"cold build of {first.name}: empty cache, packages in the pool", "bootable card", image(first), 1)
+    ]
+    if others:
+        title = f"{others[0].name} after {first.name}"
+        rows.append(_measure(title, "bootable card", image(others[0]), _RUNS))
+    everyone = list(fleet.robots.values())
+    boards = len({robot.board for robot in everyone})
+    cards = f"{len(everyone)} bootable cards"
+    rows.append(_measure(f"whole fleet after that: {boards - 1} more boards, cold", cards, image(*everyone), 1))
+    rows.append(_measure("whole fleet again", cards, image(*everyone), _RUNS))
+
+    def copy() -> int:
+        source, target = images / build.image_of(first).name, work / "copy.img"
+        target.unlink(missing_ok=True)
+        _command(["cp", "--reflink=never", str(source), str(target)])
+        return _allocated(target)
+
+    rows.append(_measure("cp of an image, its pages in memory", "the same bytes", copy, _RUNS))
+    return rows
+
+
+def _mmdebstrap(work: Path, lock: Lock) -> Row:
+    """The same packages from the same files, but for the kernel, which it installs with all dependencies only."""
+    repository = work / "repository"
+    pool.repository(lock, repository)
+    out = work / "root.tar.zst"
+    names = ",".join(package.name for package in lock.having("required", "userland"))
+    rules = [f"--dpkgopt=path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rootfs.path_rules()]
+    argv = [
+        "mmdebstrap", "--quiet", "--variant=minbase", f"--architectures={lock.architecture}", f"--include={names}",
+        *rules, SUITE, str(out), f"deb [trusted=yes] copy://{repository} {SUITE} main",
+    ]  # fmt: skip
+
+    def make() -> int:
+        _command(argv, SOURCE_DATE_EPOCH=str(lock.epoch))
+        return out.stat().st_size
+
+    return _measure("mmdebstrap, same packages without the kernel", "tar.zst, not bootable", make, 1)
+
+
+def _command(argv: list[str], **environment: str) -> None:
+    progress.command(argv)
+    done = subprocess.run(
+        argv, env=os.environ | environment, cwd=paths.PROJECT, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise UserError(f"{argv[0]} failed (status {done.returncode}): {done.stderr.strip()[-2000:]}")
+
+
+def _allocated(path: Path) -> int:
+    return path.stat().st_blocks * 512
+
+
+def _measure(work: str, made: str, make: Callable[[], int], runs: int) -> Row:
+    seconds = []
+    size = 0
+    with progress.step(work):
+        for _ in range(runs):
+            started = time.monotonic()
+            size = make()
+            seconds.append(time.monotonic() - started)
+    return Row(work, made, statistics.median(seconds), size, runs)
+
+
+def table(rows: list[Row]) -> str:
+    """The rows as text; ratios are to the first."""
+    cells = [("work", "seconds", "ratio", "bytes", "made")]
+    cells += [
+        (row.work, f"{row.seconds:.2f}", f"{row.seconds / rows[0].seconds:.3f}", progress.size(row.bytes), row.made)
+        for row in rows
+    ]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = []
+    for first, *rest, last in cells:
+        middle = (cell.rjust(width) for cell, width in zip(rest, widths[1:-1], strict=True))
+        lines.append("  ".join((first.ljust(widths[0]), *middle, last)))
+    return "\n".join(lines)
