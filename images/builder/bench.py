@@ -108,11 +108,13 @@ def _mmdebstrap(work: Path, lock: Lock) -> Row:
     pool.repository(lock, repository)
     out = work / "root.tar.zst"
     names = ",".join(package.name for package in lock.having("required", "userland"))
-    rules = [f"--dpkgopt=path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rootfs.path_rules()]
+    rules = [(keep, pattern) for keep, pattern in rootfs.path_rules() if not pattern.startswith("/etc/")]
     argv = [
-        "mmdebstrap", "--quiet", "--variant=minbase", f"--architectures={lock.architecture}", f"--include={names}",
-        *rules, SUITE, str(out), f"deb [trusted=yes] copy://{repository} {SUITE} main",
-    ]  # fmt: skip
+        *("mmdebstrap", "--quiet", "--variant=minbase", f"--architectures={lock.architecture}", f"--include={names}"),
+        *(f"--dpkgopt=path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rules),
+        "--hook-dir=/usr/share/mmdebstrap/hooks/merged-usr",
+        *(SUITE, str(out), f"deb [trusted=yes] copy://{repository} {SUITE} main"),
+    ]
 
     def make() -> int:
         _command(argv, SOURCE_DATE_EPOCH=str(lock.epoch))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from images.builder import card
 from images.builder.tools import Tools
@@ -64,7 +67,7 @@ class Entry:
 
 def differing_parts(first: Path, second: Path) -> list[Difference]:
     """The parts of the card that differ. Whatever lies beyond them counts as a part, too."""
-    end = max(first.stat().st_size, second.stat().st_size)
+    same_size, end = sorted(path.stat().st_size for path in (first, second))
     beyond = [Part("beyond the last partition", card.SIZE, end)] if end > card.SIZE else []
     found = []
     with first.open("rb") as one, second.open("rb") as other:
@@ -72,6 +75,8 @@ def differing_parts(first: Path, second: Path) -> list[Difference]:
             position, blocks = None, 0
             for start in range(part.start, part.end, _CHUNK):
                 size = min(_CHUNK, part.end - start)
+                if start + size <= same_size and not any(_holds_data(file, start, size) for file in (one, other)):
+                    continue
                 one.seek(start)
                 other.seek(start)
                 left, right = one.read(size), other.read(size)
@@ -83,6 +88,16 @@ def differing_parts(first: Path, second: Path) -> list[Difference]:
             if position is not None:
                 found.append(Difference(part, position, blocks))
     return found
+
+
+def _holds_data(file: BinaryIO, start: int, size: int) -> bool:
+    """Whether a range is anything but a hole."""
+    try:
+        return os.lseek(file.fileno(), start, os.SEEK_DATA) < start + size
+    except OSError as error:
+        if error.errno != errno.ENXIO:  # no data up to the end
+            raise
+        return False
 
 
 def first_difference(left: bytes, right: bytes) -> int:

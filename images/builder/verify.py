@@ -87,7 +87,7 @@ def verify(fleet: Fleet, robot: Robot, *, plant: bool = False) -> str:
         log = paths.BUILD / "verify.log"
         with progress.step(f"second image of {robot.name}, elsewhere"):
             _run(circumstances, log)
-        _check_clock(directory / "build" / f"rootfs-{board.name}.log", before)
+        check_clock(directory / "build" / f"rootfs-{board.name}.log", before)
         second = directory / "build" / "images" / first.name
         with progress.step("comparison"):
             toolset = tools.Tools(tools.tree(read_lock("tools")), read_lock(board.name).epoch)
@@ -138,7 +138,7 @@ def _prepare(directory: Path, board: Board, robot: Robot, *, plant: bool) -> tup
     locale = _other_locale()
     circumstances = _Circumstances(
         directory=str(directory),
-        place=_place([paths.PROJECT, paths.BUILD, paths.KEYS, Path(sys.base_prefix), Path(sys.prefix)]),
+        place=place_for([paths.PROJECT, paths.BUILD, paths.KEYS, Path(sys.base_prefix), Path(sys.prefix)]),
         robot=robot.number,
         user=user,
         locale=locale,
@@ -219,7 +219,7 @@ def _other_locale() -> str:
     return next((name for name in known if name.lower() not in ("c", "c.utf8", "c.utf-8", "posix", present)), "C")
 
 
-def _place(kept: list[Path]) -> str:
+def place_for(kept: list[Path]) -> str:
     """A directory that may become another one for the second build: nothing that it needs lies there."""
     for place in map(Path, _PLACES):
         if place.is_dir() and not any(path.resolve().is_relative_to(place) for path in kept):
@@ -366,7 +366,7 @@ def _uncover_python(staging: Path, python: Path) -> None:
 _CLOCKS = {"stage", "tools", "target"}
 
 
-def _check_clock(log: Path, before: datetime) -> None:
+def check_clock(log: Path, before: datetime) -> None:
     """Fail unless the second build's programs of every kind saw the moved clock."""
     seen = clocks(log.read_text(errors="replace"))
     moved = {f"{moment + timedelta(days=_DAYS):%F}" for moment in (before, datetime.now(UTC))}

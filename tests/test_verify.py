@@ -1,0 +1,50 @@
+"""Invariant 1: an image depends on the checkout, the lock and the robot, and on nothing else."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from images.builder import compare, paths
+from images.builder.build import image_of
+from images.builder.fleet import Fleet
+
+pytestmark = pytest.mark.image
+ROBOT = 3
+
+
+def verify(*options: str) -> subprocess.CompletedProcess[str]:
+    argv = [sys.executable, "-m", "images.builder", "verify", "--robot", str(ROBOT), *options]
+    return subprocess.run(argv, cwd=paths.PROJECT, capture_output=True, text=True, check=False)
+
+
+def test_second_build_elsewhere_is_identical() -> None:
+    done = verify()
+    assert done.returncode == 0, done.stderr
+    for varied in ("path", "user", "umask", "locale", "time zone", "host name", "clock", "empty cache"):
+        assert varied in done.stdout
+    assert not (paths.BUILD / "verify").exists()
+
+
+def test_planted_difference_fails_and_is_named() -> None:
+    done = verify("--plant")
+    assert done.returncode == 1
+    lines = [line.strip() for line in done.stderr.splitlines()]
+    assert "/etc/planted: only in the second image" in lines
+    assert [line for line in lines if line.startswith("/") and "/etc/planted" not in line] == []
+    assert any(line.startswith("slot A: differs") for line in lines)
+    assert not any(line.startswith(("MBR", "boot partition", "data partition")) for line in lines)
+
+
+def test_robots_of_a_board_differ_in_the_data_partition_only(fleet: Fleet) -> None:
+    one, other = (image_of(fleet.robots[number]) for number in (3, 4))
+    assert [difference.part.name for difference in compare.differing_parts(one, other)] == ["data partition"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="the account is made for root's second build only")
+def test_verify_leaves_no_account() -> None:
+    assert "flotilla-verify" not in Path("/etc/passwd").read_text() + Path("/etc/subuid").read_text()
