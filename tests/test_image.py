@@ -374,7 +374,9 @@ def test_nobody_has_a_password(root: Root) -> None:
     assert {line.split(":")[0] for line in shadow.splitlines()} == users, "users without an entry in /etc/shadow"
     in_passwd = [line for line in root.read("/etc/passwd").splitlines() if line.split(":")[1] != "x"]
     assert not in_passwd, f"passwords outside /etc/shadow: {in_passwd}"
-    in_groups = [line for line in root.read("/etc/gshadow").splitlines() if line.split(":")[1] not in ("", "!", "*", "!*")]
+    in_groups = [
+        line for line in root.read("/etc/gshadow").splitlines() if line.split(":")[1] not in ("", "!", "*", "!*")
+    ]
     assert not in_groups, f"groups with a password: {in_groups}"
 
 
