@@ -151,7 +151,7 @@ def table(rows: list[Row]) -> str:
     """The rows as text; ratios are to the first."""
     cells = [("work", "seconds", "ratio", "bytes", "made")]
     cells += [
-        (row.work, f"{row.seconds:.2f}", f"{row.seconds / rows[0].seconds:.3f}", progress.size(row.bytes), row.made)
+        (row.work, f"{row.seconds:.2f}", f"{row.seconds / rows[0].seconds:.4f}", progress.size(row.bytes), row.made)
         for row in rows
     ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]

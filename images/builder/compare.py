@@ -7,8 +7,8 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO
 
 from images.builder import card
 from images.builder.tools import Tools
@@ -70,7 +70,8 @@ def differing_parts(first: Path, second: Path) -> list[Difference]:
     same_size, end = sorted(path.stat().st_size for path in (first, second))
     beyond = [Part("beyond the last partition", card.SIZE, end)] if end > card.SIZE else []
     found = []
-    with first.open("rb") as one, second.open("rb") as other:
+    # Unbuffered: looking for holes moves the position that a buffer would rely on.
+    with first.open("rb", buffering=0) as one, second.open("rb", buffering=0) as other:
         for part in (*PARTS, *beyond):
             position, blocks = None, 0
             for start in range(part.start, part.end, _CHUNK):
@@ -90,7 +91,7 @@ def differing_parts(first: Path, second: Path) -> list[Difference]:
     return found
 
 
-def _holds_data(file: BinaryIO, start: int, size: int) -> bool:
+def _holds_data(file: FileIO, start: int, size: int) -> bool:
     """Whether a range is anything but a hole."""
     try:
         return os.lseek(file.fileno(), start, os.SEEK_DATA) < start + size
@@ -151,6 +152,7 @@ def images(first: Path, second: Path, tools: Tools, work: Path) -> list[str]:
         elif part.name.endswith(" partition"):
             read = ext_files
         else:
+            lines.append(f"  {_bytes_at(first, part, difference.first)} / {_bytes_at(second, part, difference.first)}")
             continue
         place = work / part.name.replace(" ", "-")
         trees = []
@@ -162,6 +164,12 @@ def images(first: Path, second: Path, tools: Tools, work: Path) -> list[str]:
         if len(files) > _FILES_NAMED:
             lines.append(f"  and {len(files) - _FILES_NAMED} more files")
     return lines
+
+
+def _bytes_at(image: Path, part: Part, position: int) -> str:
+    with image.open("rb") as file:
+        file.seek(part.start + position)
+        return file.read(_EXCERPT).hex(" ")
 
 
 def squashfs_files(tools: Tools, image: Path, offset: int, work: Path) -> dict[str, Entry]:

@@ -30,6 +30,16 @@ def test_identical_images_have_no_differing_part(tmp_path: Path) -> None:
     assert compare.differing_parts(image(tmp_path / "1", a=100), image(tmp_path / "2", a=100)) == []
 
 
+def test_identical_content_beside_holes_is_identical(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 600
+    for name in ("1", "2"):
+        with image(tmp_path / name).open("r+b") as file:
+            for offset in (0, card.BOOT.start, card.SLOTS[0].start + 3000):
+                file.seek(offset)
+                file.write(content)
+    assert compare.differing_parts(tmp_path / "1", tmp_path / "2") == []
+
+
 @pytest.mark.parametrize(
     ("offset", "name", "first"),
     [
