@@ -76,7 +76,7 @@ def differing_parts(first: Path, second: Path) -> list[Difference]:
             position, blocks = None, 0
             for start in range(part.start, part.end, _CHUNK):
                 size = min(_CHUNK, part.end - start)
-                if start + size <= same_size and not any(_holds_data(file, start, size) for file in (one, other)):
+                if start + size <= same_size and not any(holds_data(file, start, size) for file in (one, other)):
                     continue
                 one.seek(start)
                 other.seek(start)
@@ -91,7 +91,7 @@ def differing_parts(first: Path, second: Path) -> list[Difference]:
     return found
 
 
-def _holds_data(file: FileIO, start: int, size: int) -> bool:
+def holds_data(file: FileIO, start: int, size: int) -> bool:
     """Whether a range is anything but a hole."""
     try:
         return os.lseek(file.fileno(), start, os.SEEK_DATA) < start + size

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, JsonValue
 
-from images.builder import cache, card, mirror, paths
+from images.builder import cache, card, compare, mirror, paths
 from images.builder.errors import UserError
 from images.builder.filesystem import Node
 from images.builder.fleet import Board, Fleet, Robot
@@ -32,6 +32,8 @@ FORMAT: Literal[1] = 1
 SBOMS = ("spdx.json", "cdx.json")
 """Endings of the bills of materials: SPDX 2.3 and CycloneDX."""
 _DPKG_STATUS = "var/lib/dpkg/status"
+_CHUNK = 1 << 20
+"""Bytes hashed at a time."""
 
 
 class _Model(BaseModel):
@@ -376,15 +378,22 @@ def part(name: str, file: Path, start: int, length: int) -> Part:
 
 
 def hash_range(file: Path, start: int, length: int, before: hashlib._Hash | None = None) -> hashlib._Hash:
-    """SHA-256 over a range of a file, going on from what came `before`. Lets other threads work meanwhile."""
+    """SHA-256 over a range of a file, going on from what came `before`. Lets other threads work meanwhile.
+
+    Holes, most of an image, are not read: the kernel would fill as much memory with zeros.
+    """
     total = before or hashlib.sha256()
-    buffer = memoryview(bytearray(1 << 20))
+    buffer, zeros = memoryview(bytearray(_CHUNK)), memoryview(bytes(_CHUNK))
+    end = start + length
     with file.open("rb", buffering=0) as content:
-        content.seek(start)
-        while length:
-            count = content.readinto(buffer[: min(length, len(buffer))])
-            if not count:
-                raise EOFError(f"{file} ends {length} bytes early")
-            total.update(buffer[:count])
-            length -= count
+        if (missing := end - os.fstat(content.fileno()).st_size) > 0:
+            raise EOFError(f"{file} ends {missing} bytes early")
+        for position in range(start, end, _CHUNK):
+            size = min(end - position, _CHUNK)
+            if compare.holds_data(content, position, size):
+                content.seek(position)
+                size = content.readinto(buffer[:size])
+                total.update(buffer[:size])
+            else:
+                total.update(zeros[:size])
     return total

@@ -5,14 +5,11 @@ from __future__ import annotations
 import errno
 import fcntl
 import hashlib
-import http.client
 import os
 import re
 import shutil
 import subprocess
 import threading
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -203,6 +200,9 @@ def _bases(lock: Lock, package: Package, mirrors: Mirrors) -> Iterator[str]:
 
 def _fetch(address: str, package: Package, count: Callable[[int], None]) -> None:
     """Download one package beside its place in the pool and move it there once size and hash are right."""
+    import http.client  # here, because it takes a while, and a full pool needs no network
+    import urllib.error
+
     beside = file(package).with_suffix(".part")
     try:
         for attempt in range(1, _ATTEMPTS + 1):  # networks fail in passing
@@ -235,6 +235,9 @@ def _fetch(address: str, package: Package, count: Callable[[int], None]) -> None
 
 def _receive(address: str, beside: Path, count: Callable[[int], None]) -> tuple[str, int]:
     """Hash and size of what came."""
+    import http.client
+    import urllib.request
+
     digest, size = hashlib.sha256(), 0
     with urllib.request.urlopen(address, timeout=_TIMEOUT) as answer, beside.open("wb") as part:
         while chunk := answer.read(_CHUNK):

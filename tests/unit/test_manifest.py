@@ -120,6 +120,18 @@ def test_hash_of_ranges(tmp_path: Path) -> None:
         manifest.hash_range(file, 0, len(content) + 1)
 
 
+def test_hash_of_a_file_with_holes(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    with file.open("wb") as sparse:
+        for position in (5_000_000, 9_999_999):
+            sparse.seek(position)
+            sparse.write(b"data")
+        sparse.truncate(20_000_000)
+    assert file.stat().st_blocks * 512 < 1 << 20, "the file system has no holes"
+    expected = hashlib.sha256(file.read_bytes()[77:19_000_077])
+    assert manifest.hash_range(file, 77, 19_000_000).digest() == expected.digest()
+
+
 def test_inputs_follow_everything(fleet: Fleet) -> None:
     board, locks = fleet.boards["smartcoret3"], (LOCK, LOCK)
     same = manifest.inputs(board, locks, NODES)
