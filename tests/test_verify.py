@@ -15,6 +15,8 @@ from images.builder.fleet import Fleet
 
 pytestmark = pytest.mark.image
 ROBOT = 3
+KEPT = paths.BUILD / f"verify-robot{ROBOT}.img"
+"""Where a second image stays that differs."""
 
 
 def verify(*options: str) -> subprocess.CompletedProcess[str]:
@@ -23,11 +25,13 @@ def verify(*options: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_second_build_elsewhere_is_identical() -> None:
+    KEPT.touch()  # as an earlier run left it
     done = verify()
     assert done.returncode == 0, done.stderr
     for varied in ("path", "user", "umask", "locale", "time zone", "host name", "clock", "empty cache"):
         assert varied in done.stdout
     assert not (paths.BUILD / "verify").exists()
+    assert not KEPT.exists()
 
 
 def test_planted_difference_fails_and_is_named() -> None:
@@ -38,6 +42,8 @@ def test_planted_difference_fails_and_is_named() -> None:
     assert [line for line in lines if line.startswith("/") and "/etc/planted" not in line] == []
     assert any(line.startswith("slot A: differs") for line in lines)
     assert [line for line in lines if ": differs from byte" in line and not line.startswith("slot A")] == []
+    assert f"it is kept as {paths.shown(KEPT)}" in lines
+    KEPT.unlink()
 
 
 def test_robots_of_a_board_differ_in_the_data_partition_only(fleet: Fleet) -> None:

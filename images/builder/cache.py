@@ -2,6 +2,8 @@
 
 A result is a directory. It is made beside its place and renamed when complete, so that an interrupted build leaves
 nothing that could be taken for a result; what it left is removed by the next build.
+
+A build that succeeds removes old results: the newest of each kind stay, and those that it used itself.
 """
 
 from __future__ import annotations
@@ -9,12 +11,19 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import re
 import shutil
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from images.builder import host, paths
+
+_KEPT = 4
+"""Results of a kind that stay: of two boards, the present one and the one before."""
+_RESULT = re.compile(r"(.+)-[0-9a-f]{16}(\.part)?")
+_used: set[Path] = set()
 
 
 def digest(*parts: str | bytes | Path) -> str:
@@ -40,7 +49,10 @@ def digest(*parts: str | bytes | Path) -> str:
 def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
     """The directory that `make` fills, made once per `kind` and `key`."""
     final = paths.CACHE / f"{kind}-{key[:16]}"
-    if not final.exists():
+    _used.add(final)
+    if final.exists():
+        os.utime(final)  # it was of use just now: see `clean`
+    else:
         beside = final.with_name(final.name + ".part")
         discard(beside)
         beside.mkdir(parents=True)
@@ -64,7 +76,27 @@ def discard(directory: Path) -> None:
 @contextmanager
 def exclusive() -> Iterator[None]:
     """One build at a time in a build directory: a second one waits for the first."""
-    paths.CACHE.mkdir(parents=True, exist_ok=True)
-    with (paths.CACHE / ".lock").open("w") as lock:
+    with locked(paths.CACHE / ".lock"):
+        yield
+        clean()
+
+
+@contextmanager
+def locked(file: Path) -> Iterator[None]:
+    """Hold a lock for as long as the body runs: whoever else asks for it waits."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+
+
+def clean() -> None:
+    """Remove the results that this process did not use, but for the last used of each kind."""
+    kinds: dict[str, list[Path]] = defaultdict(list)
+    for path in paths.CACHE.iterdir():
+        if match := _RESULT.fullmatch(path.name):
+            kinds[match[1]].append(path)
+    for results in kinds.values():
+        results.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+        for old in set(results[_KEPT:]) - _used:
+            discard(old)

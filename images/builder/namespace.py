@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from images.builder import paths, progress
@@ -78,7 +78,6 @@ def moved_clock() -> dict[str, str]:
 def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
     """Run `python -m module arguments` in namespaces; its output goes to `log`, whose end is shown on failure."""
     argv = [*prefix(), sys.executable, "-m", module, *arguments]
-    progress.command(argv)
     environment = {
         "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
         "LC_ALL": "C.UTF-8",
@@ -86,6 +85,12 @@ def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
         "PYTHONPATH": str(paths.PROJECT),
     }
     environment |= {name: os.environ[name] for name in ("BUILD", "V") if name in os.environ} | moved_clock()
+    run_logged(module, argv, log, environment)
+
+
+def run_logged(title: str, argv: Sequence[str], log: Path, environment: Mapping[str, str] = os.environ) -> None:
+    """Run a command that ends with the builder; its output goes to `log`, whose end is shown on failure."""
+    progress.command(argv)
     with log.open("wb") as output:
         process = subprocess.Popen(argv, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
         try:
@@ -94,4 +99,4 @@ def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
             process.kill()
     if status != 0:
         tail = "\n".join(log.read_text(errors="replace").splitlines()[-30:])
-        raise UserError(f"{module} failed (status {status}); the end of {paths.shown(log)}:\n{tail}")
+        raise UserError(f"{title} failed (status {status}); the end of {paths.shown(log)}:\n{tail}")

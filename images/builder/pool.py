@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import os
 import re
@@ -12,12 +11,11 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from urllib.parse import quote
 
-from images.builder import mirror, paths, progress
+from images.builder import cache, mirror, paths, progress
 from images.builder.errors import UserError
 from images.builder.lock import SUITE, Lock, Package
 from images.builder.mirror import Mirrors
@@ -50,7 +48,7 @@ def fill(locks: Iterable[Lock], mirrors: Mirrors | None = None) -> None:
     if not _missing(wanted):
         return
     mirrors = mirrors or mirror.resolve()
-    with _exclusive():  # of two builds at once, the second finds the first one's packages
+    with cache.locked(paths.POOL / ".lock"):  # of two builds at once, the second finds the first one's packages
         missing = _missing(wanted)
         if not mirrors.snapshot:
             for archive in {package.archive for _, package in missing}:
@@ -128,14 +126,6 @@ def _corrupt(package: Package, found: str) -> str:
 def _hash(path: Path) -> str:
     with path.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
-
-
-@contextmanager
-def _exclusive() -> Iterator[None]:
-    paths.POOL.mkdir(parents=True, exist_ok=True)
-    with (paths.POOL / ".lock").open("w") as guard:
-        fcntl.flock(guard, fcntl.LOCK_EX)
-        yield
 
 
 # --- download ---

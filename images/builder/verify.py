@@ -10,7 +10,6 @@ interface for 64-bit times: coreutils. dpkg, Perl, Python and useradd see the ot
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import pwd
@@ -78,7 +77,7 @@ def verify(fleet: Fleet, robot: Robot, *, plant: bool = False) -> str:
     """
     started = time.monotonic()
     board = fleet.boards[robot.board]
-    with _exclusive(), _directory() as directory:
+    with cache.locked(paths.BUILD / ".verify.lock"), _directory() as directory:
         (first,) = build.build(fleet, [robot])
         circumstances, notes = _prepare(directory, board, robot, plant=plant)
         kept = directory / "first.img"
@@ -92,22 +91,15 @@ def verify(fleet: Fleet, robot: Robot, *, plant: bool = False) -> str:
         with progress.step("comparison"):
             toolset = tools.Tools(tools.tree(read_lock("tools")), read_lock(board.name).epoch)
             found = compare.images(kept, second, toolset, directory)
+        saved = paths.BUILD / f"verify-{robot.name}.img"
+        saved.unlink(missing_ok=True)  # of an earlier run
         if found:
-            saved = paths.BUILD / f"verify-{robot.name}.img"
             shutil.copyfile(second, saved)
             raise UserError(
                 "\n  ".join([f"{robot.name}: the image built elsewhere differs from {paths.shown(first)}:", *found])
                 + f"\n  it is kept as {paths.shown(saved)}"
             )
     return f"{robot.name}: identical; varied: {', '.join(notes)}; {time.monotonic() - started:.0f} s"
-
-
-@contextmanager
-def _exclusive() -> Iterator[None]:
-    paths.BUILD.mkdir(parents=True, exist_ok=True)
-    with (paths.BUILD / ".verify.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 @contextmanager
@@ -277,16 +269,7 @@ def _run(circumstances: _Circumstances, log: Path) -> None:
     sudo = _sudo() if os.geteuid() != 0 else []
     prefix = namespace.prefix("--uts", "--mount-proc", root=os.geteuid() == 0 or bool(sudo))
     argv = [*sudo, *prefix, "env", f"PYTHONPATH={paths.PROJECT}", sys.executable, "-m", __name__, str(description)]
-    progress.command(argv)
-    with log.open("wb") as output:
-        process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
-        try:
-            status = process.wait()
-        finally:
-            process.kill()
-    if status != 0:
-        tail = "\n".join(log.read_text(errors="replace").splitlines()[-30:])
-        raise UserError(f"the second build failed (status {status}); the end of {paths.shown(log)}:\n{tail}")
+    namespace.run_logged("the second build", argv, log)
 
 
 def main(description_file: str) -> int:

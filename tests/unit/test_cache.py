@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,6 +46,50 @@ def test_what_a_killed_build_left_is_removed_by_the_next() -> None:
     made = cache.result("kind", "0123456789abcdef", lambda out: (out / "whole").touch())
     assert [path.name for path in made.iterdir()] == ["whole"]
     assert not left.exists()
+
+
+@pytest.fixture
+def _results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results of two kinds that earlier builds used, number 0 last."""
+    for number in range(8):
+        for kind in ("root", "root-lean"):
+            os.utime(cache.result(kind, f"{number:016}", _nothing), (1000 - number, 1000 - number))
+    monkeypatch.setattr(cache, "_used", set())
+
+
+def _nothing(_: Path) -> None:
+    pass
+
+
+def _left(kind: str) -> list[int]:
+    return sorted(int(path.name[-16:]) for path in paths.CACHE.glob(f"{kind}-0*"))
+
+
+@pytest.mark.usefixtures("_results")
+def test_a_build_leaves_the_last_used_of_each_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    (paths.CACHE / "root-no-result.json").touch()
+    cache.result("root", f"{7:016}", _nothing)
+    monkeypatch.setattr(cache, "_used", set())  # the next build
+    with cache.exclusive():
+        pass
+    assert _left("root") == [0, 1, 2, 7]
+    assert _left("root-lean") == [0, 1, 2, 3]
+    assert (paths.CACHE / "root-no-result.json").exists()
+
+
+@pytest.mark.usefixtures("_results")
+def test_a_build_leaves_all_that_it_used() -> None:
+    with cache.exclusive():
+        for number in range(2, 8):
+            cache.result("root", f"{number:016}", _nothing)
+    assert _left("root") == [2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.usefixtures("_results")
+def test_a_failed_build_removes_nothing() -> None:
+    with pytest.raises(RuntimeError), cache.exclusive():
+        raise RuntimeError("no")
+    assert _left("root") == list(range(8))
 
 
 @pytest.mark.parametrize("change", ["content", "name", "executable", "new file", "link"])
