@@ -1,4 +1,4 @@
-"""How long images take, against a public builder on the same packages and against copying the same bytes.
+"""How long images take, against public builders on the same packages and against copying the same bytes.
 
 Everything runs as it would for a user: whole processes, from their start to their end.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 import statistics
 import subprocess
 import sys
@@ -24,6 +25,10 @@ from images.builder.lock import SUITE, Lock, read_lock
 _PACKAGES = paths.PROJECT / "images" / "bench-packages.txt"
 _RUNS = 5
 """Of what takes about a second; the median counts."""
+_NO_MKOSI = (
+    "mkosi: give MKOSI=… to compare: bin/mkosi in a checkout of a release of github.com/systemd/mkosi (25.3 works)"
+)
+_MKOSI_ARCHITECTURES = {"i386": "x86", "amd64": "x86-64"}
 REPORT = paths.BUILD / "reports" / "bench.json"
 
 
@@ -45,6 +50,7 @@ def bench(fleet: Fleet, first: Robot) -> str:
     others = [other for other in fleet.robots.values() if other.board == first.board and other != first]
     others.sort(key=lambda other: (other.number < first.number, other.number))
     lock = read_lock(first.board)
+    mkosi = mkosi_program()
     subprocess.run([paths.PROJECT / "images" / "install-host-packages", _PACKAGES], check=True)
     pool.fill([lock, read_lock("tools")])
     work = paths.BUILD / "bench"
@@ -52,7 +58,11 @@ def bench(fleet: Fleet, first: Robot) -> str:
     load = os.getloadavg()[0]
     try:
         rows = _ours(work, fleet, first, others)
-        rows.append(_mmdebstrap(work, lock))
+        repository = work / "repository"
+        pool.repository(lock, repository)
+        rows.append(_mmdebstrap(work, repository, lock))
+        if mkosi:
+            rows.append(_mkosi(mkosi, work / "mkosi", repository, lock))
     finally:
         cache.discard(work)
     REPORT.parent.mkdir(parents=True, exist_ok=True)
@@ -63,7 +73,8 @@ def bench(fleet: Fleet, first: Robot) -> str:
         "rows": [asdict(row) for row in rows],
     }
     REPORT.write_text(json.dumps(report, indent=1) + "\n")
-    return f"{table(rows)}\n{os.cpu_count()} cores; load before: {load:.1f}"
+    lines = [table(rows), f"{os.cpu_count()} cores; load before: {load:.1f}"]
+    return "\n".join(lines if mkosi else [*lines, _NO_MKOSI])
 
 
 def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[Row]:
@@ -102,12 +113,10 @@ def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[R
     return rows
 
 
-def _mmdebstrap(work: Path, lock: Lock) -> Row:
-    """The same packages from the same files, but for the kernel, which it installs with all dependencies only."""
-    repository = work / "repository"
-    pool.repository(lock, repository)
+def _mmdebstrap(work: Path, repository: Path, lock: Lock) -> Row:
+    """The same packages from the same files, but for the kernel."""
     out = work / "root.tar.zst"
-    names = ",".join(package.name for package in lock.having("required", "userland"))
+    names = ",".join(_userland(lock))
     rules = [(keep, pattern) for keep, pattern in rootfs.path_rules() if not pattern.startswith("/etc/")]
     argv = [
         *("mmdebstrap", "--quiet", "--variant=minbase", f"--architectures={lock.architecture}", f"--include={names}"),
@@ -121,6 +130,41 @@ def _mmdebstrap(work: Path, lock: Lock) -> Row:
         return out.stat().st_size
 
     return _measure("mmdebstrap, same packages without the kernel", "tar.zst, not bootable", make, 1)
+
+
+def mkosi_program() -> str | None:
+    """The mkosi that the user names; it runs from its checkout, without installation."""
+    if not (named := os.environ.get("MKOSI")):
+        return None
+    if not (program := shutil.which(named)):
+        raise UserError(f"MKOSI={named}: no program; {_NO_MKOSI}")
+    return str(Path(program).resolve())
+
+
+def _mkosi(program: str, directory: Path, repository: Path, lock: Lock) -> Row:
+    """The same packages as mmdebstrap's. A tar needs nothing of systemd's on this computer."""
+    for each in ("workspace", "packages"):
+        (directory / each).mkdir(parents=True)
+    argv = [
+        *(program, f"--directory={directory}", "--build-sources=", "--distribution=debian", f"--release={SUITE}"),
+        *(f"--architecture={_MKOSI_ARCHITECTURES[lock.architecture]}", f"--local-mirror=file://{repository}"),
+        *("--repository-key-check=no", "--bootable=no", "--with-docs=no", f"--source-date-epoch={lock.epoch}"),
+        *("--format=tar", "--compress-output=zstd", "--output=root"),
+        *(f"--workspace-directory={directory}/workspace", f"--package-cache-dir={directory}/packages"),
+        *(f"--package={name}" for name in _userland(lock)),
+        "build",
+    ]
+
+    def make() -> int:
+        _command(argv)
+        return (directory / "root.tar.zst").stat().st_size
+
+    return _measure("mkosi, same packages without the kernel", "tar.zst, not bootable", make, 1)
+
+
+def _userland(lock: Lock) -> list[str]:
+    """What both public builders install: they take a kernel with all its dependencies only."""
+    return [package.name for package in lock.having("required", "userland")]
 
 
 def _command(argv: list[str], **environment: str) -> None:
