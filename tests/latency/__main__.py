@@ -1,0 +1,86 @@
+"""Command line: `python -m tests.latency`, called by `make latency`, `make latency-accept` and CI."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from images.builder import inventory, paths
+from images.builder.errors import UserError
+from images.builder.fleet import Board
+from tests.latency import gate, report, results, run
+
+REPORTS = paths.BUILD / "reports"
+
+
+def _board(name: str) -> Board:
+    boards = inventory.load_fleet().boards
+    if name not in boards:
+        raise UserError(f"--board {name}: there is no such board; the inventory has {', '.join(sorted(boards))}")
+    return boards[name]
+
+
+def _measure(arguments: argparse.Namespace) -> None:
+    board = _board(arguments.board)
+    run.measure(board, arguments.plan, run.directory(board, arguments.plan))
+    _report(arguments)
+
+
+def _report(_: argparse.Namespace) -> None:
+    found = [results.read(path) for path in sorted((paths.BUILD / "latency").glob("*/results.json"))]
+    if not found:
+        raise UserError(f"{paths.shown(paths.BUILD / 'latency')} has no results; measure first: make latency")
+    print(paths.shown(report.write(found, REPORTS)))
+
+
+def _last(arguments: argparse.Namespace) -> tuple[results.Results, Path]:
+    """The last run of a board, and its baseline."""
+    board = _board(arguments.board)
+    path = run.directory(board, arguments.plan) / "results.json"
+    if not path.exists():
+        raise UserError(f"{paths.shown(path)} is missing; measure first: make latency")
+    return results.read(path), gate.BASELINES / f"{run.name(board, arguments.plan)}.json"
+
+
+def _compare(arguments: argparse.Namespace) -> None:
+    print(gate.check(*_last(arguments)))
+
+
+def _accept(arguments: argparse.Namespace) -> None:
+    found, file = _last(arguments)
+    gate.accept(found, file)
+    print(f"{paths.shown(file)} is the last run; commit it with the reason for the difference")
+
+
+_COMMANDS = {
+    "measure": (_measure, "measure a board's system in virtual time, and write the report"),
+    "compare": (_compare, "compare the last run with the accepted one: exactly"),
+    "accept": (_accept, "make the last run the accepted one"),
+    "report": (_report, "write the report of all runs there are"),
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.latency", description="Latency in virtual time.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, (_, text) in _COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument("--board", default="smartcoret3", help="name in the inventory (%(default)s)")
+        command.add_argument(
+            "--quick", dest="plan", action="store_const", const="quick", default="standard", help="the short run"
+        )
+    arguments = parser.parse_args()
+    try:
+        _COMMANDS[arguments.command][0](arguments)
+    except UserError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""Exact comparison of a run with the accepted one: what virtual time makes possible.
+
+Figures alone decide. Kernel, root, measurement, machine, QEMU and firmware are what they depend on: when figures moved,
+those that differ are named as causes; when no figure moved, a new root is none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from images.builder import paths
+from images.builder.errors import UserError
+from tests.latency.results import Binding, Latency, Outcome, Results, read
+
+BASELINES = Path(__file__).parent / "baselines"
+ACCEPT = "make latency-accept"
+_MEANING = {
+    "kernel": "another kernel",
+    "root": "another root file system",
+    "measurement": "the measurement itself was changed",
+    "machine": "another QEMU command line",
+    "qemu": "another QEMU",
+    "firmware": "another BIOS (package seabios)",
+}
+
+
+def compare(found: Results, baseline: Results) -> list[str]:
+    """What moved, one line each; empty when every figure is the same."""
+    moved = [
+        f"boot: {name} {before} → {after}"
+        for name, after in found.boot.model_dump().items()
+        if (before := baseline.boot.model_dump()[name]) != after
+    ]
+    for name in sorted(found.scenarios.keys() | baseline.scenarios.keys()):
+        before, after = baseline.scenarios.get(name), found.scenarios.get(name)
+        if before is None or after is None:
+            moved.append(f"{name}: {'new' if before is None else 'not measured any more'}")
+        else:
+            moved += [f"{name}: {text}" for text in _moved(before, after)]
+    return moved
+
+
+def causes(found: Binding, baseline: Binding) -> list[str]:
+    """What the two runs differ in besides their figures."""
+    before, after = baseline.model_dump(), found.model_dump()
+    return [
+        f"{name}: {_short(before[name])} → {_short(after[name])} ({meaning})"
+        for name, meaning in _MEANING.items()
+        if before[name] != after[name]
+    ]
+
+
+def check(found: Results, file: Path) -> str:
+    """A sentence when the run equals the accepted one in `file`; otherwise everything that moved, as a UserError."""
+    if not file.exists():
+        raise UserError(f"{paths.shown(file)} is missing: nothing to compare with; make it from this run: {ACCEPT}")
+    baseline = read(file)
+    moved = compare(found, baseline)
+    differing = causes(found.binding, baseline.binding)
+    if not moved:
+        aside = f", although there is\n  {_lines(differing)}" if differing else ""
+        return f"every figure is that of {paths.shown(file)}{aside}"
+    likely = f"likely cause:\n  {_lines(differing)}" if differing else (
+        "kernel, root, measurement, machine, QEMU and BIOS are the same: the run did not repeat, which is a defect"
+    )  # fmt: skip
+    raise UserError(
+        f"latency is not that of {paths.shown(file)}:\n  {_lines(moved)}\n{likely}\n"
+        f"`make latency` shows the distributions; if this is meant: {ACCEPT}"
+    )
+
+
+def accept(found: Results, file: Path) -> None:
+    """Make this run the one that later runs are compared with."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    beside = file.with_name(f".{file.name}.new")
+    beside.write_text(found.text())
+    beside.rename(file)
+
+
+def _moved(before: Outcome, after: Outcome) -> list[str]:
+    texts = []
+    if before.missing != after.missing:
+        texts.append(f"missing {before.missing or 'nothing'} → {after.missing or 'nothing'}")
+    for quantity in sorted(before.latencies.keys() | after.latencies.keys()):
+        old, new = before.latencies.get(quantity), after.latencies.get(quantity)
+        if old is None or new is None:
+            texts.append(f"{quantity}: {'new' if old is None else 'not measured any more'}")
+        elif old != new:
+            texts.append(f"{quantity}: {_distribution(old, new)}")
+    if not texts and before != after:
+        names = [name for name in Outcome.model_fields if getattr(before, name) != getattr(after, name)]
+        texts.append(f"{', '.join(names)} moved, no latency did")
+    return texts
+
+
+def _distribution(old: Latency, new: Latency) -> str:
+    before, after = (
+        {"samples": each.samples, "min": each.min_us, "mean": each.mean_us}
+        | {f"{percent} %": us for percent, us in each.percentiles_us.items()}
+        for each in (old, new)
+    )
+    shown = [f"{name} {before.get(name)} → {figure}" for name, figure in after.items() if before.get(name) != figure]
+    buckets = old.histogram_us.keys() | new.histogram_us.keys()
+    elsewhere = sum(abs(old.histogram_us.get(at, 0) - new.histogram_us.get(at, 0)) for at in buckets) / 2
+    return f"{', '.join(shown)}{' µs; ' if shown else ''}{elsewhere:g} samples elsewhere in the histogram"
+
+
+def _short(value: str) -> str:
+    """Hashes by their beginning, versions whole."""
+    return f"{value[:12]}…" if len(value) == 64 and value.isalnum() else value
+
+
+def _lines(texts: list[str]) -> str:
+    return "\n  ".join(texts)

@@ -1,0 +1,169 @@
+"""The page `build/reports/latency.html`, and the same figures as `latency.json`: every run there is, side by side."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+
+from tests.latency.results import Latency, Outcome, Results
+from tests.latency.scenarios import SCENARIOS
+
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM = 420, 200, 44, 28
+"""Of a chart, in pixels; the axes' labels are left and below."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One histogram in a chart."""
+
+    name: str
+    colour: int
+    """Number of a colour of the page."""
+    histogram_us: Mapping[int, int]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A series as an SVG path."""
+
+    name: str
+    colour: int
+    path: str
+
+
+@dataclass(frozen=True)
+class Tick:
+    at: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Share of samples (logarithmic, upwards) by latency in µs (logarithmic, to the right)."""
+
+    title: str
+    lines: list[Line]
+    x_ticks: list[Tick]
+    y_ticks: list[Tick]
+    width: int = _WIDTH
+    height: int = _HEIGHT
+    left: int = _LEFT
+    bottom: int = _BOTTOM
+
+
+@dataclass(frozen=True)
+class Row:
+    """A quantity of a scenario, across the runs."""
+
+    name: str
+    quantity: str
+    title: str
+    outcomes: list[Outcome | None]
+
+    @property
+    def latencies(self) -> list[Latency | None]:
+        return [outcome.latencies.get(self.quantity) if outcome else None for outcome in self.outcomes]
+
+
+def chart(title: str, series: Sequence[Series]) -> Chart:
+    """Draw histograms into one chart, each as share of its own samples, so that runs of any length compare."""
+    latencies = [max(1, at) for each in series for at in each.histogram_us]
+    low, high = _decade(min(latencies)), _decade(max(latencies), up=True)
+    least = min(1 / sum(each.histogram_us.values()) for each in series)
+    floor = math.floor(math.log10(least))
+
+    def x(latency_us: float) -> float:
+        return round(_LEFT + (math.log10(latency_us) - low) / (high - low) * (_WIDTH - _LEFT), 1)
+
+    def y(share: float) -> float:
+        return round((_HEIGHT - _BOTTOM) * math.log10(share) / floor, 1)
+
+    def path(histogram: Mapping[int, int]) -> str:
+        total, ground = sum(histogram.values()), _HEIGHT - _BOTTOM
+        return "".join(
+            f"M{x(max(1, at))} {ground}V{y(count / total)}H{max(x(at + 1), x(max(1, at)) + 1)}V{ground}"
+            for at, count in sorted(histogram.items())
+        )
+
+    return Chart(
+        title,
+        [Line(each.name, each.colour, path(each.histogram_us)) for each in series],
+        [Tick(x(10**power), f"{10**power:,}".replace(",", " ")) for power in range(low, high + 1)],
+        [Tick(y(10**power), f"{10 ** (2 + power):g} %") for power in range(floor, 1, 2 if floor < -4 else 1)],
+    )
+
+
+def _decade(value: int, *, up: bool = False) -> int:
+    return math.floor(math.log10(value)) + up
+
+
+def write(runs: Sequence[Results], directory: Path) -> Path:
+    """Write `latency.html` and `latency.json`; the page's path."""
+    directory.mkdir(parents=True, exist_ok=True)
+    ordered = sorted(runs, key=lambda run: (run.board, run.plan != "standard", run.kernel))
+    whole = {label(run): run.model_dump(mode="json") for run in ordered}
+    (directory / "latency.json").write_text(json.dumps(whole, indent=1, sort_keys=True) + "\n")
+    page = directory / "latency.html"
+    page.write_text(render(ordered))
+    return page
+
+
+def label(run: Results) -> str:
+    """`smartcoret3, debian`."""
+    return f"{run.board}, {run.kernel}{'' if run.plan == 'standard' else ' (quick)'}"
+
+
+def render(runs: Sequence[Results]) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        undefined=jinja2.StrictUndefined,
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["zip"] = zip
+    return environment.get_template("report.html.j2").render(
+        runs=[(label(run), run) for run in runs], charts=charts(runs), rows=rows(runs)
+    )
+
+
+def rows(runs: Sequence[Results]) -> list[Row]:
+    """Everything that any run measured."""
+    found = {
+        (name, quantity): outcome.title
+        for run in runs
+        for name, outcome in run.scenarios.items()
+        for quantity in outcome.latencies
+    }
+    order = [scenario.name for scenario in SCENARIOS]
+    return [
+        Row(name, quantity, title, [run.scenarios.get(name) for run in runs])
+        for (name, quantity), title in sorted(found.items(), key=lambda item: order.index(item[0][0]))
+    ]
+
+
+def charts(runs: Sequence[Results]) -> list[Chart]:
+    """One for each row: the runs against each other, and before them what the first run showed when idle."""
+    made = []
+    for row in rows(runs):
+        series = [
+            Series(label(run), number, latency.histogram_us)
+            for number, (run, latency) in enumerate(zip(runs, row.latencies, strict=True), 1)
+            if latency
+        ]
+        idle = runs[0].scenarios.get(unloaded(row.name))
+        if idle and row.quantity in idle.latencies and row.name != unloaded(row.name):
+            series.insert(0, Series(f"{label(runs[0])}, {idle.title}", 0, idle.latencies[row.quantity].histogram_us))
+        made.append(chart(f"{row.title}: {row.quantity}", series))
+    return made
+
+
+def unloaded(name: str) -> str:
+    """The scenario that shows the same without load: `uart-own` for `uart-own-cpu`, `idle` for `cpu`."""
+    stems = [scenario.name for scenario in SCENARIOS if f"{name}-".startswith(f"{scenario.name}-")]
+    return next((stem for stem in sorted(stems, key=len) if stem != name), name if "-" in name else "idle")

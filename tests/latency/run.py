@@ -1,0 +1,87 @@
+"""From a board to results: pack, boot in virtual time, make sense of what comes back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from images.builder import cache, paths, progress
+from images.builder.fleet import Board
+from tests.latency import compiler, machine, results, subject
+from tests.latency.results import Results
+from tests.latency.scenarios import SCENARIOS, Scenario
+
+Plan = Literal["standard", "quick"]
+SECONDS: dict[Plan, float] = {"standard": 60, "quick": 5}
+"""Virtual duration of a scenario."""
+_BOOT_LIMIT_S = 600
+_LIMIT_PER_SECOND = 30
+"""Of the host's clock, for each virtual second: finite, and generous to a busy host."""
+
+
+def directory(board: Board, plan: Plan) -> Path:
+    """Where a run leaves `results.json`, `raw-N` for each boot, and `console.log` and `qemu.command` of the last."""
+    return paths.BUILD / "latency" / name(board, plan)
+
+
+def name(board: Board, plan: Plan) -> str:
+    """`smartcoret3-debian`, `smartcoret3-debian-quick`."""
+    return f"{board.name}-{board.kernel}" + ("" if plan == "standard" else f"-{plan}")
+
+
+def planned(plan: Plan) -> list[Scenario]:
+    return [scenario for scenario in SCENARIOS if plan == "standard" or scenario.quick]
+
+
+def measure(board: Board, plan: Plan, out: Path) -> Results:
+    """Measure a board's system; `results.json` is in `out` when it is done."""
+    measured = subject.build(board)
+    out.mkdir(parents=True, exist_ok=True)
+    program = compiler.compile_static(subject.HERE / "serial_latency.c", board, out / "serial_latency")
+    boots: dict[tuple[str, ...], list[Scenario]] = {}
+    for scenario in planned(plan):
+        boots.setdefault(scenario.without, []).append(scenario)
+    documents: list[dict[str, Any]] = []
+    inputs, commands = [], []
+    for without, scenarios in boots.items():
+        initrd = out / "initrd.img"
+        todo = {"scenarios": [scenario.describe(SECONDS[plan]) for scenario in scenarios]}
+        programs = {"serial_latency": program}
+        inputs.append(subject.write_initrd(measured, initrd, todo, programs, machine.results_tty(board)))
+        guest = machine.Machine(board, measured.kernel, initrd, measured.arguments(without))
+        commands.append(machine.without_paths(guest.command_line(Path("/c"), Path("/r"))))
+        seconds = sum(SECONDS[plan] * scenario.share for scenario in scenarios)
+        title = " without ".join([f"latency of {name(board, plan)}", *without])
+        with progress.step(f"{title}: {len(scenarios)} scenarios, {seconds:g} virtual seconds"):
+            content = guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds)
+        initrd.unlink()
+        (out / f"raw-{len(documents)}").write_bytes(content)
+        documents.append(results.received(content))
+    binding = results.Binding(
+        **measured.hashes(),
+        measurement=cache.digest(*inputs),
+        machine=cache.digest(*commands),
+        qemu=machine.version(board),
+        firmware=cache.digest(machine.firmware(board).read_bytes()),
+    )
+    found = _results(board, plan, binding, documents)
+    (out / "results.json").write_text(found.text())
+    return found
+
+
+def _results(board: Board, plan: Plan, binding: results.Binding, documents: list[dict[str, Any]]) -> Results:
+    first = documents[0]
+    raw = {name: outcome for document in documents for name, outcome in document["scenarios"].items()}
+    return Results(
+        board=board.name,
+        kernel=board.kernel,
+        plan=plan,
+        release=first["release"],
+        version=first["version"],
+        binding=binding,
+        boot=results.Boot(**first["boot"]),
+        scenarios={
+            scenario.name: results.outcome(scenario, raw[scenario.name], scenario.samples(SECONDS[plan]))
+            for scenario in planned(plan)
+        },
+    )

@@ -1,0 +1,134 @@
+"""What is measured, under what load. Adding a line to `SCENARIOS` is all that a further measurement takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+_FILES = "/run/latency"
+"""Where the measurement's own files are in the guest."""
+OUTPUT = f"{_FILES}/output"
+
+# Loads: ordinary processes unless said otherwise. Each runs until it is killed.
+
+Command = tuple[str, ...]
+
+_UDP = """
+import socket
+port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+port.bind(("127.0.0.1", 0))
+while True:
+    port.sendto(bytes(1400), port.getsockname())
+    port.recv(2000)
+"""
+CPU: tuple[Command, ...] = (("sh", "-c", "while :; do :; done"),) * 4
+MEMORY: tuple[Command, ...] = (("python3", "-c", "while True: b'x' * (8 << 20)"),) * 2
+"""Page faults: 8 MiB are mapped, filled and given back."""
+TIMERS: tuple[Command, ...] = (("cyclictest", "-q", "-t", "10", "-p", "60", "-i", "2000", "-d", "100"),)
+"""Ten threads with timers of their own, SCHED_FIFO 60 and below. Many more would leave ordinary processes less than the
+5 % that the kernel keeps for them, by holding up every real-time thread for 50 ms."""
+SCHEDULER: tuple[Command, ...] = (("hackbench", "-g", "4", "-l", "100000000"),)
+"""160 processes that send each other messages."""
+NETWORK: tuple[Command, ...] = (("python3", "-c", _UDP),) * 2 + (("hackbench", "-i", "-g", "1", "-l", "100000000"),)
+"""UDP and TCP over the loopback interface."""
+FILES: tuple[Command, ...] = (
+    ("sh", "-c", "while :; do echo 3 >/proc/sys/vm/drop_caches; cat /usr/bin/* >/dev/null; done"),
+)
+"""Reading the compressed root with cold caches."""
+SERIAL: tuple[Command, ...] = ((f"{_FILES}/serial_latency", "/dev/robot/uart_shared", "load"),)
+"""A port as busy as 115200 Bd make it."""
+EVERYTHING = (*MEMORY, *SCHEDULER, *NETWORK, *FILES)
+
+# Meters
+
+
+@dataclass(frozen=True)
+class Meter:
+    """A program that measures."""
+
+    command: Command
+    """`{samples}`: how many. It writes JSON in the shape of `cyclictest --json` to `OUTPUT`, or prints it."""
+    quantities: dict[str, str]
+    """What its histograms are, by their names in its output."""
+    period_ms: int
+    needs: tuple[str, ...] = ()
+    """Paths without which this kernel or board cannot be measured so."""
+
+
+# Above the load, so that it starts and ends at once whatever the load is. What measures is the thread of priority 90.
+_START = ("chrt", "--fifo", "1")
+CYCLICTEST = Meter(
+    (*_START, "cyclictest", "-q", "-m", "-p", "90", "-i", "1000", "-h", "20000", "-l", "{samples}", f"--json={OUTPUT}"),
+    {"0": "wake-up"},
+    period_ms=1,
+)
+TIMERLAT = Meter(
+    (*_START, "python3", f"{_FILES}/timerlat.py", "{samples}"),
+    {"irq": "interrupt", "thread": "wake-up"},
+    period_ms=1,
+    needs=("/sys/kernel/tracing/osnoise/timerlat_period_us",),
+)
+
+
+def uart(name: str) -> Meter:
+    """Bytes through a serial port in loopback."""
+    device = f"/dev/robot/{name}"
+    return Meter(
+        (*_START, f"{_FILES}/serial_latency", device, "{samples}"), {"0": "byte"}, period_ms=10, needs=(device,)
+    )
+
+
+UART_OWN, UART_SHARED = uart("uart_own"), uart("uart_shared")
+
+# Scenarios
+
+
+@dataclass(frozen=True)
+class Scenario:
+    name: str
+    title: str
+    meter: Meter
+    loads: tuple[Command, ...] = ()
+    without: tuple[str, ...] = ()
+    """Words left out of the shipped kernel command line: such scenarios share a boot of their own."""
+    quick: bool = False
+    """Part of the short run, too."""
+    share: float = 1.0
+    """Of the usual duration."""
+
+    def samples(self, seconds: float) -> int:
+        return max(1, round(seconds * self.share * 1000 / self.meter.period_ms))
+
+    def describe(self, seconds: float) -> dict[str, Any]:
+        """The scenario as `measure.py` reads it."""
+        samples = self.samples(seconds)
+        needs = [word for load in self.loads for word in load if word.startswith("/dev/")] + list(self.meter.needs)
+        return {
+            "name": self.name,
+            "meter": [word.format(samples=samples) for word in self.meter.command],
+            "loads": [list(load) for load in self.loads],
+            "needs": needs,
+            "timeout_s": 60 + 10 * samples * self.meter.period_ms / 1000,
+        }
+
+
+SCENARIOS = (
+    Scenario("idle", "idle", CYCLICTEST, quick=True),
+    Scenario("cpu", "four processes that only compute", CYCLICTEST, CPU),
+    Scenario("memory", "page faults", CYCLICTEST, MEMORY),
+    Scenario("timers", "ten real-time threads of lower priority", CYCLICTEST, TIMERS),
+    Scenario("scheduler", "160 processes exchanging messages", CYCLICTEST, SCHEDULER, quick=True),
+    Scenario("network", "UDP and TCP over loopback", CYCLICTEST, NETWORK),
+    Scenario("files", "reading the compressed root", CYCLICTEST, FILES),
+    Scenario("serial", "a serial port at 115200 Bd", CYCLICTEST, SERIAL),
+    Scenario("everything", "memory, messages, network and files at once", CYCLICTEST, EVERYTHING),
+    Scenario("timerlat", "idle, by the kernel's tracer", TIMERLAT, share=1 / 6),
+    Scenario("timerlat-everything", "everything at once, by the kernel's tracer", TIMERLAT, EVERYTHING, share=1 / 6),
+    Scenario("uart-own", "port with an interrupt of its own, idle", UART_OWN, quick=True),
+    Scenario("uart-own-cpu", "port with an interrupt of its own, four processes that only compute", UART_OWN, CPU),
+    Scenario("uart-own-everything", "port with an interrupt of its own, everything at once", UART_OWN, EVERYTHING),
+    Scenario("uart-shared", "port with a shared interrupt, idle", UART_SHARED),
+    Scenario("uart-shared-everything", "port with a shared interrupt, everything at once", UART_SHARED, EVERYTHING),
+    Scenario("uart-own-no-irqpoll", "as uart-own, without irqpoll", UART_OWN, without=("irqpoll",)),
+    Scenario("uart-shared-no-irqpoll", "as uart-shared, without irqpoll", UART_SHARED, without=("irqpoll",)),
+)

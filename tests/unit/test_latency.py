@@ -1,0 +1,285 @@
+"""Latency in virtual time: reading outputs, percentiles, the exact comparison, the report. No QEMU."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from images.builder import inventory, paths
+from images.builder.errors import UserError
+from tests.latency import gate, machine, report, results, run, subject, timerlat
+from tests.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
+from tests.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
+
+IDLE = Scenario("idle", "idle", CYCLICTEST)
+ACTIVITY = {"idle_s": 9.0, "interrupts": 1000, "context_switches": 2000, "elapsed_s": 10.0}
+
+
+def made(**changes: Any) -> Results:
+    """A run with one scenario; `histogram` and fields of the binding may differ."""
+    histogram = changes.pop("histogram", {23: 60, 30: 39, 45: 1})
+    binding = dict.fromkeys(Binding.model_fields, "a" * 64) | changes
+    activity = Activity(busy_percent=10, interrupts_per_s=100, context_switches_per_s=200)
+    idle = Outcome(title="idle", latencies={"wake-up": Latency.of(histogram)}, activity=activity)
+    return Results(
+        board="board", kernel="debian", plan="standard", release="6.1", version="#1", binding=Binding(**binding),
+        boot=Boot(userspace_us=1, first_step_us=2, finished_us=3, failed_units=[]), scenarios={"idle": idle},
+    )  # fmt: skip
+
+
+# Figures
+
+
+@pytest.mark.parametrize(
+    ("percent", "expected"), [(0.1, 1), (50, 1), (50.1, 2), (99, 2), (99.9, 3), (99.99, 4), (100, 4)]
+)
+def test_percentile_is_by_nearest_rank(percent: float, expected: int) -> None:
+    assert results.percentile({1: 5000, 2: 4900, 3: 90, 4: 10}, percent) == expected
+
+
+def test_percentile_of_one_sample() -> None:
+    assert {results.percentile({7: 1}, percent) for percent in results.PERCENTILES} == {7}
+
+
+def test_latency_follows_from_its_histogram() -> None:
+    latency = Latency.of({30: 39, 23: 60, 99: 0, 45: 1})
+    assert (latency.samples, latency.min_us, latency.mean_us, latency.max_us) == (100, 23, 25.95, 45)
+    assert latency.histogram_us == {23: 60, 30: 39, 45: 1}
+    assert latency.percentiles_us == {"50": 23, "90": 30, "99": 30, "99.9": 45, "99.99": 45, "100": 45}
+    with pytest.raises(ValueError, match="without samples"):
+        Latency.of({5: 0})
+
+
+# What comes from the guest
+
+
+def _sent(document: dict[str, Any]) -> bytes:
+    body = json.dumps(document).encode()
+    return f"{len(body)} {hashlib.sha256(body).hexdigest()}\n".encode() + body
+
+
+def test_results_arrive_whole_or_not_at_all() -> None:
+    sent = _sent({"release": "6.1"})
+    assert results.received(sent) == {"release": "6.1"}
+    for damaged in (sent[:-1], sent.replace(b"6.1", b"6.2"), b"[    1.0] a kernel message\n" + sent, b""):
+        with pytest.raises(UserError, match="arrived damaged"):
+            results.received(damaged)
+
+
+def test_failure_in_the_guest_is_shown() -> None:
+    with pytest.raises(UserError, match=r"(?s)failed in the guest.*No such file: cyclictest"):
+        results.received(_sent({"error": "Traceback\nNo such file: cyclictest\n"}))
+
+
+def _raw(histogram: dict[str, int], cycles: int, **more: int) -> dict[str, Any]:
+    output = {"thread": {"0": {"histogram": histogram, "cycles": cycles, **more}}}
+    return {"output": json.dumps(output), "activity": ACTIVITY}
+
+
+def test_outcome_of_cyclictest() -> None:
+    outcome = results.outcome(IDLE, _raw({"23": 2, "45": 1}, 3, max=45), 3)
+    assert outcome.latencies["wake-up"].histogram_us == {23: 2, 45: 1}
+    assert outcome.activity == Activity(busy_percent=10, interrupts_per_s=100, context_switches_per_s=200)
+
+
+def test_samples_beyond_the_histogram_count_as_the_latest() -> None:
+    outcome = results.outcome(IDLE, _raw({"23": 2}, 4, max=34576), 4)
+    assert outcome.latencies["wake-up"].histogram_us == {23: 2, 34576: 2}
+
+
+def test_missing_samples_are_an_error() -> None:
+    with pytest.raises(UserError, match="idle: wake-up: 3 samples instead of 4"):
+        results.outcome(IDLE, _raw({"23": 3}, 3, max=23), 4)
+    with pytest.raises(UserError, match="idle: the meter's output is no JSON: 'Unable to open'"):
+        results.outcome(IDLE, {"output": "Unable to open", "activity": ACTIVITY}, 4)
+
+
+def test_what_a_kernel_lacks_is_reported() -> None:
+    outcome = results.outcome(IDLE, {"missing": ["/sys/kernel/tracing/osnoise"]}, 4)
+    assert outcome.missing == ["/sys/kernel/tracing/osnoise"]
+    assert not outcome.latencies
+
+
+TRACE = """# tracer: timerlat
+  <idle>-0      [000] d.h1.  54.001: #1   context    irq timer_latency       900 ns
+  timerlat/0-8  [000] .....  54.002: #1   context thread timer_latency     11700 ns
+  <idle>-0      [000] d.h1.  54.003: #2   context    irq timer_latency      1100 ns
+  kworker-5     [000] d....  54.004: irq_noise: local_timer:236 start 54.0 duration 8000 ns
+  timerlat/0-8  [000] .....  54.005: #2   context thread timer_latency     29900 ns
+  <idle>-0      [000] d.h1.  54.006: #3   context    irq timer_latency     99000 ns
+"""
+
+
+def test_timerlat_histograms_and_the_cause_of_the_worst() -> None:
+    found = timerlat.summary(TRACE.splitlines(), 2)
+    assert found["thread"]["irq"] == {"cycles": 2, "histogram": {0: 1, 1: 1}}
+    assert found["thread"]["thread"] == {"cycles": 2, "histogram": {11: 1, 29: 1}}
+    assert ["irq timer_latency" in found["trace"][0], "duration 8000 ns" in found["trace"][1]] == [True, True]
+    assert found["trace"][-1].endswith("29900 ns")
+
+
+# The gate
+
+
+def test_same_figures_pass() -> None:
+    assert gate.compare(made(), made()) == []
+
+
+def test_moved_percentiles_are_named() -> None:
+    (line,) = gate.compare(made(histogram={23: 60, 30: 38, 45: 1, 52: 1}), made())
+    moved = "mean 25.95 → 26.17, 99 % 30 → 45, 99.9 % 45 → 52, 99.99 % 45 → 52, 100 % 45 → 52 µs"
+    assert line == f"idle: wake-up: {moved}; 1 samples elsewhere in the histogram"
+
+
+def test_a_histogram_that_keeps_every_percentile_still_differs() -> None:
+    before, after = {10: 50, 20: 1, 22: 1, 30: 48}, {10: 50, 21: 2, 30: 48}
+    assert Latency.of(before).percentiles_us == Latency.of(after).percentiles_us
+    assert gate.compare(made(histogram=after), made(histogram=before)) == [
+        "idle: wake-up: 2 samples elsewhere in the histogram"
+    ]
+
+
+def test_new_and_lost_scenarios_and_boot_times_are_named() -> None:
+    base = made()
+    boot = base.boot.model_copy(update={"finished_us": 4})
+    other = base.model_copy(update={"scenarios": {"cpu": base.scenarios["idle"]}, "boot": boot})
+    assert gate.compare(other, base) == ["boot: finished_us 3 → 4", "cpu: new", "idle: not measured any more"]
+
+
+def test_gate(tmp_path: Path) -> None:
+    file = tmp_path / "baselines" / "board-debian.json"
+    with pytest.raises(UserError, match=r"board-debian\.json is missing.*make latency-accept"):
+        gate.check(made(), file)
+    gate.accept(made(), file)
+    assert gate.check(made(), file).startswith("every figure is that of")
+    assert "another root file system" in gate.check(made(root="b" * 64), file)
+    with pytest.raises(UserError) as moved:
+        gate.check(made(histogram={23: 99, 46: 1}, kernel="b" * 64, qemu="8.0"), file)
+    message = str(moved.value)
+    assert "100 % 45 → 46" in message
+    assert f"kernel: {'a' * 12}… → {'b' * 12}… (another kernel)" in message
+    assert "→ 8.0 (another QEMU)" in message
+    assert "root:" not in message
+    assert "make latency-accept" in message
+    with pytest.raises(UserError, match="the run did not repeat, which is a defect"):
+        gate.check(made(histogram={23: 99, 46: 1}), file)
+
+
+def test_a_damaged_baseline_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "board-debian.json"
+    file.write_text(made().text().replace('"samples": 100', '"samples": "many"'))
+    with pytest.raises(UserError, match=r"board-debian\.json: scenarios\.idle\.latencies\.wake-up\.samples: .*integer"):
+        results.read(file)
+
+
+def test_results_are_the_same_bytes_again(tmp_path: Path) -> None:
+    file = tmp_path / "results.json"
+    file.write_text(made().text())
+    assert results.read(file).text() == made().text()
+
+
+# The report
+
+
+def test_report_is_one_page_with_every_figure(tmp_path: Path) -> None:
+    lean = made(histogram={20: 99, 1234: 1}).model_copy(update={"kernel": "lean"})
+    page = report.write([lean, made()], tmp_path).read_text()
+    assert not re.search(r"<(script|link|img|iframe)|https?://|url\(", page), "the page must be self-contained"
+    assert '<td class="worst">45</td>' in page
+    assert '<td class="worst">1234</td>' in page
+    assert page.count("<svg") == 1
+    assert list(json.loads((tmp_path / "latency.json").read_text())) == ["board, debian", "board, lean"]
+
+
+def test_report_says_what_is_missing(tmp_path: Path) -> None:
+    lacking = Outcome(title="idle", missing=["/sys/kernel/<tracing>"])
+    lean = made().model_copy(update={"kernel": "lean", "scenarios": {"idle": lacking}})
+    page = report.write([made(), lean], tmp_path).read_text()
+    assert "not in this kernel or board: /sys/kernel/&lt;tracing&gt;" in page
+
+
+def test_chart_is_logarithmic_both_ways() -> None:
+    chart = report.chart("title", [report.Series("a", 1, {1: 9, 10: 900, 100: 91})])
+    tops = [(float(x), float(y)) for x, y in re.findall(r"M([\d.]+) [\d.]+V([\d.]+)", chart.lines[0].path)]
+    (x1, y1), (x10, y10), (x100, _) = tops
+    assert x10 - x1 == pytest.approx(x100 - x10, abs=0.2)
+    assert y1 - y10 == pytest.approx(2 * (chart.y_ticks[0].at - chart.y_ticks[1].at), abs=0.2)
+    assert [tick.text for tick in chart.x_ticks] == ["1", "10", "100", "1 000"]
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"), [("cpu", "idle"), ("idle", "idle"), ("uart-own-cpu", "uart-own"), ("uart-own", "uart-own")]
+)
+def test_each_load_is_compared_with_the_same_without(name: str, stem: str) -> None:
+    assert report.unloaded(name) == stem
+
+
+# What is booted
+
+
+def test_scenarios_are_well_formed() -> None:
+    names = [scenario.name for scenario in SCENARIOS]
+    assert len(set(names)) == len(names)
+    assert any(scenario.quick for scenario in SCENARIOS)
+    for scenario in SCENARIOS:
+        described = json.dumps(scenario.describe(60))
+        assert "{samples}" not in described
+        assert scenario.samples(60) >= 1000, f"{scenario.name}: too few samples for its percentiles"
+    assert [scenario.name for scenario in run.planned("standard")] == names
+
+
+def test_modules_load_in_order_of_their_needs() -> None:
+    listed = "kernel/fs/ext4/ext4.ko: kernel/lib/crc16.ko kernel/fs/jbd2.ko\nkernel/lib/crc16.ko:\nkernel/fs/jbd2.ko:\n"
+    order = ["kernel/fs/jbd2.ko", "kernel/lib/crc16.ko", "kernel/fs/ext4/ext4.ko"]
+    assert subject.load_order(listed, ("loop", "ext4")) == order
+    assert subject.load_order("", ("loop", "ext4")) == [], "what the kernel has built in needs no file"
+
+
+def test_key_is_one_that_openssh_reads(tmp_path: Path) -> None:
+    private, public = subject.ssh_key("a name")
+    assert subject.ssh_key("a name") == (private, public)
+    assert subject.ssh_key("another")[1] != public
+    file = tmp_path / "key"
+    file.write_text(private)
+    file.chmod(0o600)
+    read = subprocess.run(["ssh-keygen", "-y", "-f", file], capture_output=True, text=True, check=True).stdout
+    assert read.split()[:2] == public.split()[:2]
+
+
+def test_machine_is_the_board_in_virtual_time(tmp_path: Path) -> None:
+    board = inventory.load_fleet().boards["smartcoret3"]
+    guest = machine.Machine(board, tmp_path / "vmlinuz", tmp_path / "initrd.img", ("quiet",))
+    argv = guest.command_line(tmp_path / "console", tmp_path / "results")
+    assert {"-nodefaults", "shift=3,sleep=off", f"{board.qemu.machine},usb=off,hpet=off"} <= set(argv)
+    assert f"file,id=port11,path={tmp_path}/results" in argv
+    assert machine.results_tty(board) == "ttyS11"
+    assert [argv[at + 1] for at, word in enumerate(argv) if word == "-device"][1:] == board.qemu.devices
+    shown = machine.without_paths(argv)
+    assert str(tmp_path) not in shown
+    assert "/" not in shown.replace("/qemu-system", ""), f"a path is left in {shown}"
+
+
+def test_kernel_command_line_is_the_shipped_one() -> None:
+    from images.builder import card
+    from images.builder.build import BoardBuild
+
+    board = inventory.load_fleet().boards["smartcoret3"]
+    shipped = card.kernel_arguments(board)
+    nothing: Any = None
+    made = BoardBuild(board, nothing, nothing, nothing, Path(), Path(), Path())
+    measured = subject.Subject(made)
+    assert list(measured.arguments()[: len(shipped)]) == shipped
+    assert "irqpoll" in measured.arguments()
+    assert "irqpoll" not in measured.arguments(without=("irqpoll",))
+
+
+def test_nothing_in_the_measurement_knows_this_computer() -> None:
+    for path in (paths.PROJECT / "tests" / "latency").rglob("*.*"):
+        if path.suffix in (".py", ".c", ".j2", ".json"):
+            assert str(paths.PROJECT) not in path.read_text(), f"{paths.shown(path)} has an absolute path"
