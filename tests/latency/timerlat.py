@@ -59,11 +59,10 @@ def main(samples: int) -> None:
     write("tracing_on", 1)
     time.sleep((samples + 10) * _PERIOD_US / 1e6)
     write("tracing_on", 0)
-    write("current_tracer", "nop")
     with (_TRACING / "trace").open() as trace:
         print(json.dumps(summary(trace, samples)))
+    write("current_tracer", "nop")  # which empties the trace
     write("events/osnoise/enable", 0)
-    write("trace", "")
 
 
 if __name__ == "__main__":
