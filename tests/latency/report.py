@@ -70,12 +70,14 @@ class Row:
         return [outcome.latencies.get(self.quantity) if outcome else None for outcome in self.outcomes]
 
 
-def chart(title: str, series: Sequence[Series]) -> Chart:
-    """Draw histograms into one chart, each as share of its own samples, so that runs of any length compare."""
-    latencies = [max(1, at) for each in series for at in each.histogram_us]
-    low, high = _decade(min(latencies)), _decade(max(latencies), up=True)
+def chart(title: str, series: Sequence[Series], extent_us: tuple[int, int]) -> Chart:
+    """Draw histograms into one chart, each as share of its own samples, so that runs of any length compare.
+
+    `extent_us`: the least and the greatest latency that the axis has to show.
+    """
+    low, high = math.floor(math.log10(extent_us[0])), math.floor(math.log10(extent_us[1])) + 1
     least = min(1 / sum(each.histogram_us.values()) for each in series)
-    floor = math.floor(math.log10(least))
+    floor = math.log10(least) - 0.3  # so that a single sample stands above the ground
 
     def x(latency_us: float) -> float:
         return round(_LEFT + (math.log10(latency_us) - low) / (high - low) * (_WIDTH - _LEFT), 1)
@@ -94,12 +96,8 @@ def chart(title: str, series: Sequence[Series]) -> Chart:
         title,
         [Line(each.name, each.colour, path(each.histogram_us)) for each in series],
         [Tick(x(10**power), f"{10**power:,}".replace(",", " ")) for power in range(low, high + 1)],
-        [Tick(y(10**power), f"{10 ** (2 + power):g} %") for power in range(floor, 1, 2 if floor < -4 else 1)],
+        [Tick(y(10**power), f"{10 ** (2 + power):g} %") for power in range(math.ceil(floor), 1)],
     )
-
-
-def _decade(value: int, *, up: bool = False) -> int:
-    return math.floor(math.log10(value)) + up
 
 
 def write(runs: Sequence[Results], directory: Path) -> Path:
@@ -150,7 +148,8 @@ def rows(runs: Sequence[Results]) -> list[Row]:
 def charts(runs: Sequence[Results]) -> list[Chart]:
     """One for each row: the runs against each other, and before them what the first run showed when idle."""
     made = []
-    for row in rows(runs):
+    table = rows(runs)
+    for row in table:
         series = [
             Series(label(run), number, latency.histogram_us)
             for number, (run, latency) in enumerate(zip(runs, row.latencies, strict=True), 1)
@@ -159,8 +158,14 @@ def charts(runs: Sequence[Results]) -> list[Chart]:
         idle = runs[0].scenarios.get(unloaded(row.name))
         if idle and row.quantity in idle.latencies and row.name != unloaded(row.name):
             series.insert(0, Series(f"{label(runs[0])}, {idle.title}", 0, idle.latencies[row.quantity].histogram_us))
-        made.append(chart(f"{row.title}: {row.quantity}", series))
+        made.append(chart(f"{row.title}: {row.quantity}", series, _extent_us(table, row.quantity)))
     return made
+
+
+def _extent_us(table: Sequence[Row], quantity: str) -> tuple[int, int]:
+    """One axis for all charts of a quantity, so that they compare by eye."""
+    found = [latency for row in table if row.quantity == quantity for latency in row.latencies if latency]
+    return max(1, min(latency.min_us for latency in found)), max(latency.max_us for latency in found)
 
 
 def unloaded(name: str) -> str:

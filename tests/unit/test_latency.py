@@ -205,11 +205,12 @@ def test_report_says_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_chart_is_logarithmic_both_ways() -> None:
-    chart = report.chart("title", [report.Series("a", 1, {1: 9, 10: 900, 100: 91})])
+    chart = report.chart("title", [report.Series("a", 1, {1: 9, 10: 900, 100: 91})], (1, 100))
     tops = [(float(x), float(y)) for x, y in re.findall(r"M([\d.]+) [\d.]+V([\d.]+)", chart.lines[0].path)]
     (x1, y1), (x10, y10), (x100, _) = tops
     assert x10 - x1 == pytest.approx(x100 - x10, abs=0.2)
-    assert y1 - y10 == pytest.approx(2 * (chart.y_ticks[0].at - chart.y_ticks[1].at), abs=0.2)
+    decade = chart.y_ticks[1].at - chart.y_ticks[2].at
+    assert y1 - y10 == pytest.approx(2 * decade, abs=0.2)
     assert [tick.text for tick in chart.x_ticks] == ["1", "10", "100", "1 000"]
 
 
