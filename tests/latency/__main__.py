@@ -9,20 +9,21 @@ from pathlib import Path
 from images.builder import inventory, paths
 from images.builder.errors import UserError
 from images.builder.fleet import Board
-from tests.latency import gate, report, results, run
+from tests.latency import boottime, gate, report, results, run
 
 REPORTS = paths.BUILD / "reports"
 
 
-def _board(name: str) -> Board:
+def _board(arguments: argparse.Namespace) -> Board:
     boards = inventory.load_fleet().boards
+    name = arguments.board
     if name not in boards:
         raise UserError(f"--board {name}: there is no such board; the inventory has {', '.join(sorted(boards))}")
-    return boards[name]
+    return boards[name].model_copy(update={"kernel": arguments.kernel} if arguments.kernel else {})
 
 
 def _measure(arguments: argparse.Namespace) -> None:
-    board = _board(arguments.board)
+    board = _board(arguments)
     run.measure(board, arguments.plan, run.directory(board, arguments.plan))
     _report(arguments)
 
@@ -36,11 +37,19 @@ def _report(_: argparse.Namespace) -> None:
 
 def _last(arguments: argparse.Namespace) -> tuple[results.Results, Path]:
     """The last run of a board, and its baseline."""
-    board = _board(arguments.board)
+    board = _board(arguments)
     path = run.directory(board, arguments.plan) / "results.json"
     if not path.exists():
         raise UserError(f"{paths.shown(path)} is missing; measure first: make latency")
     return results.read(path), gate.BASELINES / f"{run.name(board, arguments.plan)}.json"
+
+
+def _boot_time(arguments: argparse.Namespace) -> None:
+    board = _board(arguments)
+    text = boottime.measure(board, paths.BUILD / "latency" / f"{run.name(board, 'standard')}-boot")
+    REPORTS.mkdir(parents=True, exist_ok=True)
+    (REPORTS / f"boot-time-{run.name(board, 'standard')}.txt").write_text(text + "\n")
+    print(text)
 
 
 def _compare(arguments: argparse.Namespace) -> None:
@@ -58,6 +67,7 @@ _COMMANDS = {
     "compare": (_compare, "compare the last run with the accepted one: exactly"),
     "accept": (_accept, "make the last run the accepted one"),
     "report": (_report, "write the report of all runs there are"),
+    "boot-time": (_boot_time, "boot once in virtual time, and say where it goes"),
 }
 
 
@@ -67,6 +77,7 @@ def main() -> int:
     for name, (_, text) in _COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("--board", default="smartcoret3", help="name in the inventory (%(default)s)")
+        command.add_argument("--kernel", choices=("debian", "lean"), help="instead of the one the inventory names")
         command.add_argument(
             "--quick", dest="plan", action="store_const", const="quick", default="standard", help="the short run"
         )

@@ -106,6 +106,10 @@ def document(plan: dict[str, Any]) -> dict[str, Any]:
     try:
         found["command_line"] = Path("/proc/cmdline").read_text().split()
         found["boot"] = boot()
+        found["commands"] = {
+            name: subprocess.run(argv, capture_output=True, text=True, check=True).stdout
+            for name, argv in plan.get("commands", {}).items()
+        }
         for description in plan["scenarios"]:
             print(f"latency: {description['name']}", file=sys.stderr, flush=True)
             found["scenarios"][description["name"]] = scenario(description)

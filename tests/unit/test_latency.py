@@ -13,7 +13,7 @@ import pytest
 
 from images.builder import inventory, paths
 from images.builder.errors import UserError
-from tests.latency import gate, machine, report, results, run, subject, timerlat
+from tests.latency import boottime, gate, machine, report, results, run, subject, timerlat
 from tests.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
 from tests.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
 
@@ -219,6 +219,28 @@ def test_chart_is_logarithmic_both_ways() -> None:
 )
 def test_each_load_is_compared_with_the_same_without(name: str, stem: str) -> None:
     assert report.unloaded(name) == stem
+
+
+# Where a boot goes
+
+DMESG = """[    0.000000] Linux version 6.1
+[    0.500000] initcall populate_rootfs+0x0/0x30 returned 0 after 1500000 usecs
+[    2.250000] Freeing initrd memory
+[    2.300000] Run /init as init process
+"""
+
+
+def test_boot_account() -> None:
+    board = inventory.load_fleet().boards["smartcoret3"]
+    boot = {"userspace_us": 2_290_000, "finished_us": 9_000_000, "first_step_us": 7_000_000}
+    commands = {"dmesg": DMESG, "blame": "2.000s ssh.service\n", "chain": "graphical.target @9s\n"}
+    account = boottime.account(board, {"release": "6.1", "boot": boot, "commands": commands})
+    assert "   2.290 kernel" in account
+    assert "   6.710 user space" in account
+    assert "   1.500 populate_rootfs+0x0/0x30" in account
+    assert "   1.750 Freeing initrd memory" in account
+    assert "Run /init" not in account, "that was after the kernel's part"
+    assert "2.000s ssh.service" in account
 
 
 # What is booted
