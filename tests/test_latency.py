@@ -14,7 +14,8 @@ import pytest
 from images.builder.boot import DIE_WITH_PARENT
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
-from tests.latency import gate, machine, run
+from tests.conftest import GuestFactory
+from tests.latency import gate, machine, report, run, target
 from tests.latency.results import Latency, Results
 
 pytestmark = pytest.mark.boot
@@ -78,6 +79,22 @@ def test_gate_notices_one_sample_elsewhere(measured: Results, tmp_path: Path) ->
     changed = measured.model_copy(update={"scenarios": measured.scenarios | {"idle": moved}})
     with pytest.raises(UserError, match=rf"idle: wake-up: .*100 % {latest} → {latest + 1} µs"):
         gate.check(changed, file)
+
+
+def test_the_same_scenarios_on_a_robot_in_real_time(
+    guest: GuestFactory, fleet: Fleet, artefacts: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A guest stands in for the robot. How late it is depends on this host and is not judged."""
+    monkeypatch.setitem(run.SECONDS, "quick", 1)
+    robot = guest(3)
+    found = target.measure(robot.robot, fleet.boards[robot.robot.board], robot.shell, "quick", artefacts)
+    samples = {
+        name: outcome.latencies[next(iter(outcome.latencies))].samples for name, outcome in found.scenarios.items()
+    }
+    assert samples == {"idle": 1000, "scheduler": 1000, "uart-own": 33}
+    assert "real time" in (report.write([found], artefacts)).read_text()
+    left = robot.shell.run(["ls", "/run/latency", "/dev/robot/uart_own"], check=False)
+    assert left.stderr.count("No such file") == 2, left.stdout
 
 
 def test_a_guest_that_does_not_end_is_ended(board: Board, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from images.builder import inventory, paths
 from images.builder.errors import UserError
 from images.builder.fleet import Board
-from tests.latency import boottime, gate, report, results, run
+from tests.latency import boottime, gate, report, results, run, target
 
 REPORTS = paths.BUILD / "reports"
 
@@ -23,8 +23,15 @@ def _board(arguments: argparse.Namespace) -> Board:
 
 
 def _measure(arguments: argparse.Namespace) -> None:
-    board = _board(arguments)
-    run.measure(board, arguments.plan, run.directory(board, arguments.plan))
+    if arguments.target:
+        fleet = inventory.load_fleet()
+        robot = target.named(fleet, arguments.target)
+        with target.connect(robot) as shell:
+            out = paths.BUILD / "latency" / f"{robot.name}-{arguments.plan}"
+            target.measure(robot, fleet.boards[robot.board], shell, arguments.plan, out)
+    else:
+        board = _board(arguments)
+        run.measure(board, arguments.plan, run.directory(board, arguments.plan))
     _report(arguments)
 
 
@@ -58,6 +65,8 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 def _accept(arguments: argparse.Namespace) -> None:
     found, file = _last(arguments)
+    if found.plan == "disk":
+        raise UserError("--disk: has bounds, not a baseline: tests/latency/scenarios.py")
     gate.accept(found, file)
     print(f"{paths.shown(file)} is the last run; commit it with the reason for the difference")
 
@@ -78,9 +87,13 @@ def main() -> int:
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("--board", default="smartcoret3", help="name in the inventory (%(default)s)")
         command.add_argument("--kernel", choices=("debian", "lean"), help="instead of the one the inventory names")
-        command.add_argument(
+        if name == "measure":
+            command.add_argument("--target", metavar="ssh:ROBOT", help="a robot in real time, instead of virtual time")
+        plan = command.add_mutually_exclusive_group()
+        plan.add_argument(
             "--quick", dest="plan", action="store_const", const="quick", default="standard", help="the short run"
         )
+        plan.add_argument("--disk", dest="plan", action="store_const", const="disk", help="with a disk: bounded only")
     arguments = parser.parse_args()
     try:
         _COMMANDS[arguments.command][0](arguments)

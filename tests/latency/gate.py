@@ -11,6 +11,7 @@ from pathlib import Path
 from images.builder import paths
 from images.builder.errors import UserError
 from tests.latency.results import Binding, Latency, Outcome, Results, read
+from tests.latency.scenarios import SCENARIOS
 
 BASELINES = Path(__file__).parent / "baselines"
 ACCEPT = "make latency-accept"
@@ -52,6 +53,8 @@ def causes(found: Binding, baseline: Binding) -> list[str]:
 
 def check(found: Results, file: Path) -> str:
     """A sentence when the run equals the accepted one in `file`; otherwise everything that moved, as a UserError."""
+    if found.plan == "disk":
+        return _check_bounds(found)
     if not file.exists():
         raise UserError(f"{paths.shown(file)} is missing: nothing to compare with; make it from this run: {ACCEPT}")
     baseline = read(file)
@@ -67,6 +70,20 @@ def check(found: Results, file: Path) -> str:
         f"latency is not that of {paths.shown(file)}:\n  {_lines(moved)}\n{likely}\n"
         f"`make latency` shows the distributions; if this is meant: {ACCEPT}"
     )
+
+
+def _check_bounds(found: Results) -> str:
+    """For what does not repeat."""
+    exceeded = [
+        f"{scenario.name}: {quantity}: max {latency.max_us} µs, and {scenario.limit_us} µs is the bound"
+        for scenario in SCENARIOS
+        if scenario.limit_us and scenario.name in found.scenarios
+        for quantity, latency in found.scenarios[scenario.name].latencies.items()
+        if latency.max_us > scenario.limit_us
+    ]
+    if exceeded:
+        raise UserError(f"latency with a disk:\n  {_lines(exceeded)}\nbounds are in tests/latency/scenarios.py")
+    return "every latency with a disk is within its bound"
 
 
 def accept(found: Results, file: Path) -> None:

@@ -7,12 +7,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import jinja2
 
-from tests.latency.results import Latency, Outcome, Results
+from tests.latency.results import Latency, Outcome, Plan, Results
+from tests.latency.run import VIRTUAL
 from tests.latency.scenarios import SCENARIOS
 
+_PLANS = get_args(Plan)
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 420, 200, 44, 28
 """Of a chart, in pixels; the axes' labels are left and below."""
 
@@ -103,7 +106,7 @@ def chart(title: str, series: Sequence[Series], extent_us: tuple[int, int]) -> C
 def write(runs: Sequence[Results], directory: Path) -> Path:
     """Write `latency.html` and `latency.json`; the page's path."""
     directory.mkdir(parents=True, exist_ok=True)
-    ordered = sorted(runs, key=lambda run: (run.board, run.plan != "standard", run.kernel))
+    ordered = sorted(runs, key=lambda run: (run.board, _PLANS.index(run.plan), run.kernel))
     whole = {label(run): run.model_dump(mode="json") for run in ordered}
     (directory / "latency.json").write_text(json.dumps(whole, indent=1, sort_keys=True) + "\n")
     page = directory / "latency.html"
@@ -112,8 +115,9 @@ def write(runs: Sequence[Results], directory: Path) -> Path:
 
 
 def label(run: Results) -> str:
-    """`smartcoret3, debian`."""
-    return f"{run.board}, {run.kernel}{'' if run.plan == 'standard' else ' (quick)'}"
+    """`smartcoret3, debian`; `robot3, real time` of a robot."""
+    name = f"{run.board}, {run.kernel}" if run.where == VIRTUAL else run.where
+    return name if run.plan == "standard" else f"{name} ({run.plan})"
 
 
 def render(runs: Sequence[Results]) -> str:

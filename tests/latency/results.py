@@ -110,12 +110,18 @@ class Binding(_Model):
     """SHA-256 of the BIOS."""
 
 
+Plan = Literal["standard", "quick", "disk"]
+"""Which scenarios, and for how long."""
+
+
 class Results(_Model):
     format: Literal[1] = 1
     board: str
     kernel: str
     """`debian` or `lean`."""
-    plan: Literal["standard", "quick"]
+    plan: Plan
+    where: str
+    """`virtual time`, or the robot."""
     release: str
     """Of the kernel, as `uname -r`."""
     version: str

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from images.builder import cache, paths, progress
 from images.builder.fleet import Board
 from tests.latency import compiler, machine, results, subject
-from tests.latency.results import Results
+from tests.latency.results import Plan, Results
 from tests.latency.scenarios import SCENARIOS, Scenario
 
-Plan = Literal["standard", "quick"]
-SECONDS: dict[Plan, float] = {"standard": 60, "quick": 5}
+SECONDS: dict[Plan, float] = {"standard": 60, "quick": 5, "disk": 60}
 """Virtual duration of a scenario."""
+VIRTUAL = "virtual time"
+_DISK_BYTES = 256 << 20
 _BOOT_LIMIT_S = 600
 _LIMIT_PER_SECOND = 30
 """Of the host's clock, for each virtual second: finite, and generous to a busy host."""
@@ -30,7 +31,9 @@ def name(board: Board, plan: Plan) -> str:
 
 
 def planned(plan: Plan) -> list[Scenario]:
-    return [scenario for scenario in SCENARIOS if plan == "standard" or scenario.quick]
+    if plan == "disk":
+        return [scenario for scenario in SCENARIOS if scenario.limit_us]
+    return [scenario for scenario in SCENARIOS if not scenario.limit_us and (plan == "standard" or scenario.quick)]
 
 
 def measure(board: Board, plan: Plan, out: Path) -> Results:
@@ -48,7 +51,8 @@ def measure(board: Board, plan: Plan, out: Path) -> Results:
         todo = {"scenarios": [scenario.describe(SECONDS[plan]) for scenario in scenarios]}
         programs = {"serial_latency": program}
         inputs.append(subject.write_initrd(measured, initrd, todo, programs, machine.results_tty(board)))
-        guest = machine.Machine(board, measured.kernel, initrd, measured.arguments(without))
+        disk = _empty_disk(out / "disk.img") if plan == "disk" else None
+        guest = machine.Machine(board, measured.kernel, initrd, measured.arguments(without), disk)
         commands.append(machine.without_paths(guest.command_line(Path("/c"), Path("/r"))))
         seconds = sum(SECONDS[plan] * scenario.share for scenario in scenarios)
         title = " without ".join([f"latency of {name(board, plan)}", *without])
@@ -64,24 +68,39 @@ def measure(board: Board, plan: Plan, out: Path) -> Results:
         qemu=machine.version(board),
         firmware=cache.digest(machine.firmware(board).read_bytes()),
     )
-    found = _results(board, plan, binding, documents)
+    found = results_of(board, plan, binding, documents, planned(plan), VIRTUAL)
     (out / "results.json").write_text(found.text())
     return found
 
 
-def _results(board: Board, plan: Plan, binding: results.Binding, documents: list[dict[str, Any]]) -> Results:
+def _empty_disk(path: Path) -> Path:
+    with path.open("wb") as file:
+        file.truncate(_DISK_BYTES)
+    return path
+
+
+def results_of(
+    board: Board,
+    plan: Plan,
+    binding: results.Binding,
+    documents: list[dict[str, Any]],
+    scenarios: list[Scenario],
+    where: str,
+) -> Results:
+    """Make sense of what the boots of a run sent."""
     first = documents[0]
     raw = {name: outcome for document in documents for name, outcome in document["scenarios"].items()}
     return Results(
         board=board.name,
         kernel=board.kernel,
         plan=plan,
+        where=where,
         release=first["release"],
         version=first["version"],
         binding=binding,
         boot=results.Boot(**first["boot"]),
         scenarios={
             scenario.name: results.outcome(scenario, raw[scenario.name], scenario.samples(SECONDS[plan]))
-            for scenario in planned(plan)
+            for scenario in scenarios
         },
     )

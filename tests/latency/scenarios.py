@@ -37,6 +37,11 @@ FILES: tuple[Command, ...] = (
 """Reading the compressed root with cold caches."""
 SERIAL: tuple[Command, ...] = ((f"{_FILES}/serial_latency", "/dev/robot/uart_shared", "load"),)
 """A port as busy as 115200 Bd make it."""
+DISK: tuple[Command, ...] = (
+    ("sh", "-c", "while :; do dd if=$0 of=/dev/null bs=128k count=512 iflag=direct; done", "/dev/sda"),
+    ("sh", "-c", "while :; do dd if=/dev/zero of=$0 bs=128k count=512 oflag=direct; done", "/dev/sda"),
+)
+"""Reading and writing a disk past the cache."""
 EVERYTHING = (*MEMORY, *SCHEDULER, *NETWORK, *FILES)
 
 # Meters
@@ -95,6 +100,9 @@ class Scenario:
     """Part of the short run, too."""
     share: float = 1.0
     """Of the usual duration."""
+    limit_us: int | None = None
+    """With a disk attached, whose answers depend on the host, results do not repeat: they have a bound instead. Such
+    scenarios are a plan of their own."""
 
     def samples(self, seconds: float) -> int:
         return max(1, round(seconds * self.share * 1000 / self.meter.period_ms))
@@ -138,4 +146,6 @@ SCENARIOS = (
     Scenario(
         "uart-shared-no-irqpoll", "shared interrupt, without irqpoll", UART_SHARED, share=_SHORT, without=("irqpoll",)
     ),
+    Scenario("disk-idle", "a disk attached, idle", CYCLICTEST, share=_SHORT, limit_us=150),
+    Scenario("disk", "reading and writing a disk", CYCLICTEST, DISK, share=_SHORT, limit_us=250),
 )

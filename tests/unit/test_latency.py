@@ -13,7 +13,7 @@ import pytest
 
 from images.builder import inventory, paths
 from images.builder.errors import UserError
-from tests.latency import boottime, gate, machine, report, results, run, subject, timerlat
+from tests.latency import boottime, gate, machine, report, results, run, subject, target, timerlat
 from tests.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
 from tests.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
 
@@ -28,8 +28,9 @@ def made(**changes: Any) -> Results:
     activity = Activity(busy_percent=10, interrupts_per_s=100, context_switches_per_s=200)
     idle = Outcome(title="idle", latencies={"wake-up": Latency.of(histogram)}, activity=activity)
     return Results(
-        board="board", kernel="debian", plan="standard", release="6.1", version="#1", binding=Binding(**binding),
-        boot=Boot(userspace_us=1, first_step_us=2, finished_us=3, failed_units=[]), scenarios={"idle": idle},
+        board="board", kernel="debian", plan="standard", where=run.VIRTUAL, release="6.1", version="#1",
+        binding=Binding(**binding), boot=Boot(userspace_us=1, first_step_us=2, finished_us=3, failed_units=[]),
+        scenarios={"idle": idle},
     )  # fmt: skip
 
 
@@ -171,6 +172,16 @@ def test_gate(tmp_path: Path) -> None:
         gate.check(made(histogram={23: 99, 46: 1}), file)
 
 
+def test_with_a_disk_there_are_bounds_only(tmp_path: Path) -> None:
+    idle = made(histogram={150: 1}).scenarios["idle"]
+    within = made().model_copy(update={"plan": "disk", "scenarios": {"disk-idle": idle}})
+    assert gate.check(within, tmp_path / "none") == "every latency with a disk is within its bound"
+    idle = made(histogram={151: 1}).scenarios["idle"]
+    beyond = within.model_copy(update={"scenarios": {"disk-idle": idle}})
+    with pytest.raises(UserError, match="disk-idle: wake-up: max 151 µs, and 150 µs is the bound"):
+        gate.check(beyond, tmp_path / "none")
+
+
 def test_a_damaged_baseline_is_named(tmp_path: Path) -> None:
     file = tmp_path / "board-debian.json"
     file.write_text(made().text().replace('"samples": 100', '"samples": "many"'))
@@ -202,6 +213,11 @@ def test_report_says_what_is_missing(tmp_path: Path) -> None:
     lean = made().model_copy(update={"kernel": "lean", "scenarios": {"idle": lacking}})
     page = report.write([made(), lean], tmp_path).read_text()
     assert "not in this kernel or board: /sys/kernel/&lt;tracing&gt;" in page
+
+
+def test_a_robot_is_named_as_such() -> None:
+    assert report.label(made().model_copy(update={"where": "robot3, real time"})) == "robot3, real time"
+    assert report.label(made().model_copy(update={"plan": "quick"})) == "board, debian (quick)"
 
 
 def test_chart_is_logarithmic_both_ways() -> None:
@@ -254,7 +270,7 @@ def test_scenarios_are_well_formed() -> None:
         described = json.dumps(scenario.describe(60))
         assert "{samples}" not in described
         assert scenario.samples(60) >= 1000, f"{scenario.name}: too few samples for its percentiles"
-    assert [scenario.name for scenario in run.planned("standard")] == names
+    assert [*run.planned("standard"), *run.planned("disk")] == list(SCENARIOS)
 
 
 def test_modules_load_in_order_of_their_needs() -> None:
@@ -283,6 +299,9 @@ def test_machine_is_the_board_in_virtual_time(tmp_path: Path) -> None:
     assert f"file,id=port11,path={tmp_path}/results" in argv
     assert machine.results_tty(board) == "ttyS11"
     assert [argv[at + 1] for at, word in enumerate(argv) if word == "-device"][1:] == board.qemu.devices
+    disk = machine.Machine(board, tmp_path, tmp_path, (), tmp_path / "disk").command_line(tmp_path, tmp_path)
+    assert "ide-hd,drive=disk,bus=ide.0,unit=0" in disk
+    assert str(tmp_path) not in machine.without_paths(disk)
     shown = machine.without_paths(argv)
     assert str(tmp_path) not in shown
     assert "/" not in shown.replace("/qemu-system", ""), f"a path is left in {shown}"
@@ -300,6 +319,21 @@ def test_kernel_command_line_is_the_shipped_one() -> None:
     assert list(measured.arguments()[: len(shipped)]) == shipped
     assert "irqpoll" in measured.arguments()
     assert "irqpoll" not in measured.arguments(without=("irqpoll",))
+
+
+def test_targets_are_robots_of_the_inventory() -> None:
+    fleet = inventory.load_fleet()
+    assert target.named(fleet, "ssh:robot3").number == 3
+    for wrong in ("robot3", "ssh:robot9", "telnet:robot3"):
+        with pytest.raises(UserError, match=f"--target {wrong}: write ssh:NAME; the inventory has robot1, robot2"):
+            target.named(fleet, wrong)
+
+
+def test_a_port_with_a_device_is_not_measured_on_a_robot() -> None:
+    fleet = inventory.load_fleet()
+    board = fleet.boards["smartcoret3"]
+    assert target._free_ports(fleet.robots[4], board) == {"uart_own": "COM2", "uart_shared": "COM5"}
+    assert target._free_ports(fleet.robots[3], board) == {"uart_own": "COM2"}
 
 
 def test_nothing_in_the_measurement_knows_this_computer() -> None:
