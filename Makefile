@@ -10,12 +10,15 @@ MAKEFLAGS += --no-print-directory
 .DEFAULT_GOAL := help
 
 ##@ Cards
-.PHONY: image images flash boot ssh verify size
+.PHONY: image images kernel flash boot ssh verify size
 image: | setup ## card image of one robot: make image ROBOT=3
 	$(Q)$(FLOTILLA) image --robot $(call need,ROBOT)
 
 images: | setup ## card images of the whole fleet
 	$(Q)$(FLOTILLA) image --all
+
+kernel: | setup ## our own real-time kernel as a Debian package: make kernel BOARD=smartcoret3
+	$(Q)$(FLOTILLA) kernel --board $(call need,BOARD)
 
 flash: | setup ## write a card and read it back: make flash ROBOT=3 DEV=/dev/sdX (or CARD=file)
 	$(Q)$(FLOTILLA) flash --robot $(call need,ROBOT) $(if $(CARD),--file $(CARD),--device $(call need,DEV)) $(if $(FORCE),--force $(FORCE))

@@ -27,8 +27,8 @@ from typing import Any
 import pytest
 
 from images.builder import inventory, paths, qemu
-from images.builder.build import image_of
-from images.builder.fleet import Fleet, Robot
+from images.builder.build import build, image_of
+from images.builder.fleet import Board, Fleet, Robot
 from tests.lab.guest import Guest
 from tests.lab.segment import Segment
 from tests.lab.ssh import Ssh
@@ -44,6 +44,9 @@ class RobotGuest:
     """A robot of the fleet as a guest in QEMU."""
 
     robot: Robot
+    board: Board
+    """The inventory's, but for the kernel where a test asked for another."""
+    image: Path
     machine: Guest
     """Power, console, serial ports, cable, QMP."""
     shell: Ssh
@@ -56,9 +59,10 @@ class RobotGuest:
 
 
 GuestFactory = Callable[..., RobotGuest]
-"""`guest(number)`: the robot's guest, booted, with SSH connected. `fresh_guest` also takes the arguments of `Guest`
-(`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of `qemu.Options`), `segment=segment` to put it on a
-network with others, and `boot=False` to power it on oneself."""
+"""`guest(number)`: the robot's guest, booted, with SSH connected; `kernel=` for another than its board's.
+
+`fresh_guest` also takes the arguments of `Guest` (`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of
+`qemu.Options`), `segment=segment` to put it on a network with others, and `boot=False` to power it on oneself."""
 
 
 @pytest.fixture(scope="session")
@@ -69,20 +73,23 @@ def fleet() -> Fleet:
 
 @pytest.fixture(scope="session")
 def guest(fleet: Fleet, session_artefacts: Path) -> Iterator[GuestFactory]:
-    """`guest(3)`: robot 3, booted when a test first asks and shared by all that ask later.
+    """`guest(3)`: robot 3, booted when a test first asks and shared by all that ask later. `guest(3, "debian")` is the
+    same robot with another kernel than its board's.
 
     A boot that failed is not tried again: every test that needs it fails at once, with the first cause.
     """
-    booted: dict[int, RobotGuest | BaseException] = {}
+    booted: dict[tuple[int, str], RobotGuest | BaseException] = {}
     with ExitStack() as cleanup:
 
-        def shared(number: int) -> RobotGuest:
-            if number not in booted:
+        def shared(number: int, kernel: str | None = None) -> RobotGuest:
+            key = number, kernel or fleet.boards[inventory.robot(fleet, number).board].kernel
+            if key not in booted:
+                directory = session_artefacts / "robot{}-{}".format(*key)
                 try:
-                    booted[number] = _boot(fleet, number, session_artefacts / f"robot{number}", cleanup)
+                    booted[key] = _boot(fleet, number, directory, cleanup, kernel=kernel)
                 except BaseException as error:
-                    booted[number] = error
-            found = booted[number]
+                    booted[key] = error
+            found = booted[key]
             if isinstance(found, BaseException):
                 raise found
             return found
@@ -125,13 +132,18 @@ def _boot(
     directory: Path,
     cleanup: ExitStack,
     *,
+    kernel: str | None = None,
     boot: bool = True,
     segment: Segment | None = None,
     qemu_options: dict[str, Any] | None = None,
     **arguments: Any,
 ) -> RobotGuest:
     robot = inventory.robot(fleet, number)
-    image = image_of(robot)
+    board = fleet.boards[robot.board]
+    if kernel and kernel != board.kernel:
+        board, image = _with_kernel(fleet, robot, kernel)
+    else:
+        image = image_of(robot)
     if not image.exists():
         pytest.fail(f"{paths.shown(image)} is missing; build it: make image ROBOT={number}", pytrace=False)
     link: qemu.UserLink | qemu.Wire
@@ -140,10 +152,18 @@ def _boot(
     else:
         link = qemu.UserLink(subnet=fleet.network.subnet, guest=robot.address, station=_station(fleet))
     options = qemu.Options(**{"name": robot.name, "mac": qemu.robot_mac(number), "link": link, **(qemu_options or {})})
-    machine = cleanup.enter_context(Guest(fleet.boards[robot.board], image, directory, options, **arguments))
+    machine = cleanup.enter_context(Guest(board, image, directory, options, **arguments))
     port = (lambda: segment.ssh_port(robot.address)) if segment else machine.ssh_port
-    guest = RobotGuest(robot, machine, cleanup.enter_context(Ssh(robot, "127.0.0.1", port)))
+    guest = RobotGuest(robot, board, image, machine, cleanup.enter_context(Ssh(robot, "127.0.0.1", port)))
     if boot:
         machine.on()
         guest.wait_booted()
     return guest
+
+
+def _with_kernel(fleet: Fleet, robot: Robot, kernel: str) -> tuple[Board, Path]:
+    """The robot's board and image as if the inventory named another kernel."""
+    board = fleet.boards[robot.board].model_copy(update={"kernel": kernel})
+    other = fleet.model_copy(update={"boards": fleet.boards | {robot.board: board}})
+    (image,) = build(other, [robot], paths.IMAGES / kernel)
+    return board, image

@@ -23,7 +23,6 @@ import pytest
 
 from images.builder import card, identity, paths, qemu, tools
 from images.builder.boot import ssh_options
-from images.builder.build import image_of
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
 from images.builder.lock import read_lock
@@ -34,6 +33,8 @@ pytestmark = pytest.mark.boot
 
 PENTIUM, PC = 3, 2
 """The robots that stand for their boards."""
+SYSTEMS = [(PENTIUM, "lean"), (PENTIUM, "debian"), (PC, "debian")]
+"""Boards and kernels that every image must boot with."""
 SECONDS = 60
 """Limit for what takes a few on an idle host."""
 MEMORY_LIMIT_MB = {PENTIUM: 40, PC: 70}
@@ -85,44 +86,47 @@ def report(pytestconfig: pytest.Config) -> Iterator[Report]:
 # Guests
 
 
-def _settled(guest: GuestFactory, number: int, fleet: Fleet, report: Report) -> RobotGuest:
+def _settled(guest: GuestFactory, number: int, report: Report, kernel: str | None = None) -> RobotGuest:
     """The shared guest once everything that starts at boot has started."""
     asked = time.monotonic()
-    robot = guest(number)
+    robot = guest(number, kernel)
     reached = time.monotonic()
     sh(robot, "systemctl is-system-running --wait", check=False)
     prompt = rf"{robot.robot.name} login: "
     login = robot.machine.seconds_to(prompt)
     power_on = robot.machine.console.arrival(prompt) - login
-    report.add(robot.robot.board, login_s=login)
+    report.add(label(robot), login_s=login)
     if power_on > asked:  # else somebody else had booted it, and its SSH stands since long
-        report.add(robot.robot.board, ssh_s=reached - power_on)
+        report.add(label(robot), ssh_s=reached - power_on)
     shown = sh(robot, "systemctl show -p UserspaceTimestampMonotonic -p FinishTimestampMonotonic")
     stamps = {name: int(value) / 1e6 for name, value in (line.split("=") for line in shown.splitlines())}
-    kernel, finish = stamps["UserspaceTimestampMonotonic"], stamps["FinishTimestampMonotonic"]
-    report.add(robot.robot.board, kernel_s=kernel, userspace_s=finish - kernel)
-    with image_of(robot.robot).open("rb") as image:
+    begun, finish = stamps["UserspaceTimestampMonotonic"], stamps["FinishTimestampMonotonic"]
+    report.add(label(robot), kernel_s=begun, userspace_s=finish - begun)
+    with robot.image.open("rb") as image:
         image.seek(card.SLOTS[0].start + 40)  # `bytes_used` of the squashfs
-        report.add(robot.robot.board, root_mb=int.from_bytes(image.read(8), "little") / 1e6)
+        report.add(label(robot), root_mb=int.from_bytes(image.read(8), "little") / 1e6)
     return robot
 
 
 @pytest.fixture(scope="module")
-def pentium(guest: GuestFactory, fleet: Fleet, report: Report) -> RobotGuest:
-    return _settled(guest, PENTIUM, fleet, report)
+def pentium(guest: GuestFactory, report: Report) -> RobotGuest:
+    """With the kernel that the inventory gives the board."""
+    return _settled(guest, PENTIUM, report)
 
 
-@pytest.fixture(scope="module", params=[PENTIUM, PC], ids=["smartcoret3", "x86_64"])
-def robot(request: pytest.FixtureRequest, guest: GuestFactory, fleet: Fleet, report: Report) -> RobotGuest:
-    if request.param == PENTIUM:
-        found: RobotGuest = request.getfixturevalue("pentium")
-        return found
-    return _settled(guest, request.param, fleet, report)
+@pytest.fixture(scope="module", params=SYSTEMS, ids=["smartcoret3-lean", "smartcoret3-debian", "x86_64-debian"])
+def robot(request: pytest.FixtureRequest, guest: GuestFactory, report: Report) -> RobotGuest:
+    return _settled(guest, request.param[0], report, request.param[1])
 
 
 @pytest.fixture
-def board(robot: RobotGuest, fleet: Fleet) -> Board:
-    return fleet.boards[robot.robot.board]
+def board(robot: RobotGuest) -> Board:
+    return robot.board
+
+
+def label(robot: RobotGuest) -> str:
+    """What a figure is about."""
+    return f"{robot.board.name} {robot.board.kernel}"
 
 
 def sh(robot: RobotGuest, script: str, *, check: bool = True, timeout: float = SECONDS) -> str:
@@ -198,7 +202,7 @@ def test_memory_after_boot(robot: RobotGuest, report: Report) -> None:
     shown = sh(robot, "cat /proc/meminfo")
     kib = {name: int(value) for name, value in re.findall(r"^(\w+): +(\d+) kB", shown, re.MULTILINE)}
     used = (kib["MemTotal"] - kib["MemAvailable"]) * 1024 / 1e6
-    report.add(robot.robot.board, memory_used_mb=used)
+    report.add(label(robot), memory_used_mb=used)
     limit = MEMORY_LIMIT_MB[robot.robot.number]
     processes = sh(robot, "ps -e -o rss=,comm= --sort=-rss | head")
     assert used <= limit, f"{used:.1f} MB in use (MemTotal - MemAvailable), {limit} allowed; largest:\n{processes}"
@@ -493,7 +497,7 @@ def _uarts(robot: RobotGuest) -> dict[str, dict[str, str]]:
 
 
 def test_devices_have_names_and_rates(pentium: RobotGuest, fleet: Fleet) -> None:
-    board = fleet.boards[pentium.robot.board]
+    board = pentium.board
     assert pentium.robot.devices, "the fleet of the tests has no device on this robot"
     assert set(sh(pentium, "ls /dev/robot").split()) == set(pentium.robot.devices)
     for name, device in pentium.robot.devices.items():
@@ -508,7 +512,7 @@ EIGHT = [f"COM{number}" for number in range(5, 13)]
 
 def test_eight_port_board_serves_all_ports_at_once(pentium: RobotGuest, fleet: Fleet) -> None:
     """Both ways on every port while they share interrupts, each byte to the right connector."""
-    ports = {name: fleet.boards[pentium.robot.board].ports[name].tty for name in EIGHT}
+    ports = {name: pentium.board.ports[name].tty for name in EIGHT}
     uarts = _uarts(pentium)
     lines = {name: uarts[tty]["irq"] for name, tty in ports.items()}
     assert len(set(lines.values())) < len(lines), f"no two ports share an interrupt: {lines}"
@@ -827,7 +831,7 @@ def test_power_cut_while_writing(fresh_guest: GuestFactory, fleet: Fleet, toolse
 def test_damaged_slot_falls_back_and_a_hang_ends(fresh_guest: GuestFactory, toolset: Tools, tmp_path: Path) -> None:
     """Slot A is damaged and has one try left, slot B is good; then the running system hangs. One card for both."""
     robot = fresh_guest(PENTIUM, boot=False, qemu_options={"watchdog": "pause"})
-    broken = _with_broken_first_slot(image_of(robot.robot), tmp_path, toolset)
+    broken = _with_broken_first_slot(robot.image, tmp_path, toolset)
     qemu.make_overlay(broken, robot.machine.directory / "card.qcow2", qemu.CARD_BYTES)
     robot.machine.on()
     robot.machine.console.expect(r"Kernel panic", 2 * SECONDS)
@@ -846,10 +850,7 @@ def test_damaged_slot_falls_back_and_a_hang_ends(fresh_guest: GuestFactory, tool
 
 
 def _with_broken_first_slot(image: Path, directory: Path, toolset: Tools) -> Path:
-    """A copy of a card whose slot B is what slot A was, and A half written; A has one try left.
-
-    Not its superblock: with that damaged, the initramfs tries to mount it 500 times before it gives up, for minutes.
-    """
+    """A copy of a card whose slot B is what slot A was, and A erased; A has one try left."""
     broken, boot, kernel = directory / "card", directory / "boot", directory / "file"
     subprocess.run(["cp", "--sparse=always", str(image), str(broken)], check=True)
     first, second = card.SLOTS
@@ -858,7 +859,7 @@ def _with_broken_first_slot(image: Path, directory: Path, toolset: Tools) -> Pat
         root = file.read(first.size)
         file.seek(second.start)
         file.write(root.rstrip(b"\0"))
-        file.seek(first.start + 4096)
+        file.seek(first.start)
         file.write(bytes(16 * card.MIB))
         file.seek(card.BOOT.start)
         content = file.read(card.BOOT.size)
@@ -868,7 +869,8 @@ def _with_broken_first_slot(image: Path, directory: Path, toolset: Tools) -> Pat
         )
         assert content.count(before) == 1, "the environment block is not where it was"
         boot.write_bytes(content.replace(before, after))
-        for name in ("vmlinuz", "initrd.img"):
+        listing = toolset.run("usr/sbin/debugfs", "-R", "ls -p /A", boot)
+        for name in re.findall(r"^/\d+/100\d+/\d+/\d+/([^/]+)/", listing, re.MULTILINE):
             toolset.run("usr/sbin/debugfs", "-R", f"dump /A/{name} {kernel}", boot)
             toolset.run("usr/sbin/debugfs", "-w", "-R", f"write {kernel} /B/{name}", boot)
         try:

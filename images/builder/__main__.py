@@ -66,6 +66,12 @@ def _bench(arguments: argparse.Namespace) -> None:
     print(bench.bench(fleet, inventory.robot(fleet, robot)))
 
 
+def _kernel(arguments: argparse.Namespace) -> None:
+    from images.builder import kernel
+
+    print(kernel.report([arguments.board]))
+
+
 def _lock(_: argparse.Namespace) -> None:
     from images.builder import lock
 
@@ -86,6 +92,7 @@ _COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
     "size": (_size, "what takes the room of an image"),
     "verify": (_verify, "build a second time under other circumstances and compare"),
     "bench": (_bench, "wall times and ratios against other builders"),
+    "kernel": (_kernel, "build a kernel of our own as a Debian package"),
     "lock": (_lock, "resolve the package lists"),
     "check-fleet": (_check_fleet, "validate the inventory"),
 }
@@ -97,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
     for name in ("image", "flash", "boot", "ssh", "size", "verify", "bench"):
         made[name].add_argument("--robot", type=int, help="number in the inventory")
+    made["kernel"].add_argument("--board", required=True, help="name in kernel/kernels.yml")
     made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
     made["verify"].add_argument("--plant", action="store_true", help="plant a difference, which must be found")
     target = made["flash"].add_mutually_exclusive_group(required=True)

@@ -25,22 +25,22 @@ class BoardBuild:
     manifest: Path
 
 
-def image_of(robot: Robot) -> Path:
-    return paths.IMAGES / f"{robot.name}.img"
+def image_of(robot: Robot, directory: Path = paths.IMAGES) -> Path:
+    return directory / f"{robot.name}.img"
 
 
 def board_build(board: Board) -> BoardBuild:
     """Everything up to the identity; from the cache where nothing changed."""
     lock, tools_lock = read_lock(board.name), read_lock("tools")
-    pool.fill([lock, tools_lock])
+    pool.fill([lock.without("kernel") if board.kernel == "lean" else lock, tools_lock])
     toolset = tools.Tools(tools.tree(tools_lock), lock.epoch)
     root = rootfs.build(board, lock, tools_lock)
     base = card.base(board, root, toolset, lock.epoch)
     return BoardBuild(board, lock, tools_lock, toolset, root, base, manifest.shared(board, lock, root, base, toolset))
 
 
-def build(fleet: Fleet, robots: list[Robot]) -> list[Path]:
-    """Make the images of `robots`; each is replaced only when it is complete."""
+def build(fleet: Fleet, robots: list[Robot], directory: Path = paths.IMAGES) -> list[Path]:
+    """Make the images of `robots` in `directory`; each is replaced only when it is complete."""
     host.check()
     namespace.check()
     with cache.exclusive():
@@ -48,14 +48,14 @@ def build(fleet: Fleet, robots: list[Robot]) -> list[Path]:
         for robot in robots:
             if robot.board not in boards:
                 boards[robot.board] = board_build(fleet.boards[robot.board])
-        return [_robot_image(fleet, robot, boards[robot.board]) for robot in robots]
+        return [_robot_image(fleet, robot, boards[robot.board], directory) for robot in robots]
 
 
-def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild) -> Path:
+def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) -> Path:
     """Hashing takes longest, and lets other threads work: the board's part is hashed while the robot's is made."""
     started = time.monotonic()
-    final = image_of(robot)
-    work = paths.IMAGES / f".{robot.name}.part"
+    final = image_of(robot, directory)
+    work = directory / f".{robot.name}.part"
     cache.discard(work)
     work.mkdir(parents=True)
     new = work / final.name
@@ -79,7 +79,7 @@ def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild) -> Path:
             mapped = mapping.result().mapped
         new.with_suffix(".sha256").write_text(f"{whole}  {final.name}\n")
         for made_file in sorted(work.iterdir()):
-            made_file.rename(paths.IMAGES / made_file.name)
+            made_file.rename(directory / made_file.name)
     finally:
         cache.discard(work)
     print(

@@ -150,16 +150,17 @@ def _boot_nodes(board: Board, root: Path, template: Path) -> list[Node]:
         keep_trailing_newline=True,
         autoescape=False,
     )
-    arguments = kernel_arguments(board)
-    config = environment.from_string(template.read_text()).render(board=board, slots=SLOTS, kernel_arguments=arguments)
+    files = [root / name for name in ("vmlinuz", "initrd.img") if (root / name).exists()]
+    config = environment.from_string(template.read_text()).render(
+        board=board, slots=SLOTS, kernel_arguments=kernel_arguments(board), initramfs=len(files) > 1
+    )
     variables = "# GRUB Environment Block\nORDER=A B\nA_OK=1\nA_TRY=0\nB_OK=0\nB_TRY=0\n"
     return [
         Node(PurePosixPath("/grub")),
         Node(PurePosixPath("/grub/grub.cfg"), config.encode(), 0o644),
         Node(PurePosixPath("/grub/grubenv"), variables.encode().ljust(1024, b"#"), 0o644),
         Node(PurePosixPath("/A")),
-        Node(PurePosixPath("/A/vmlinuz"), (root / "vmlinuz").read_bytes(), 0o644),
-        Node(PurePosixPath("/A/initrd.img"), (root / "initrd.img").read_bytes(), 0o644),
+        *(Node(PurePosixPath("/A") / file.name, file.read_bytes(), 0o644) for file in files),
         Node(PurePosixPath("/B")),
     ]
 

@@ -45,6 +45,7 @@ _RECIPES = {
     "smartcoret3": _Recipe("i386", ("robot", "smartcoret3")),
     "x86_64": _Recipe("amd64", ("robot", "x86_64")),
     "tools": _Recipe("amd64", ("tools",), system=False),
+    "toolchain": _Recipe("amd64", ("toolchain",), system=False),
     "verify": _Recipe("i386", ("verify",), system=False),
 }
 NAMES = tuple(_RECIPES)
@@ -98,6 +99,10 @@ class Lock:
     def date(self, archive: str) -> datetime:
         """When an archive's newest suite was released."""
         return max(suite.date for suite in self.suites if suite.archive == archive)
+
+    def without(self, role: Role) -> Lock:
+        """The lock but for the packages of one role."""
+        return dataclasses.replace(self, packages=tuple(each for each in self.packages if each.role != role))
 
     def having(self, *roles: Role) -> tuple[Package, ...]:
         """The packages of some roles."""

@@ -164,8 +164,9 @@ def shared(board: Board, lock: Lock, root: Path, base: Path, tools: Tools) -> Pa
             parts=board_parts(root, base),
             packages=packages(status),
         )
-        installed = {(package.name, package.version) for package in made.packages}
-        locked = {(package.name, package.version) for package in lock.packages}
+        own = {f"linux-image-{made.kernel}"} if board.kernel == "lean" else set()
+        installed = {(package.name, package.version) for package in made.packages if package.name not in own}
+        locked = {(package.name, package.version) for package in (lock.without("kernel") if own else lock).packages}
         if installed != locked:  # a defect of the builder, not the user's
             raise RuntimeError(f"installed and locked packages differ: {sorted(installed ^ locked)}")
         (out / "shared.json").write_text(made.model_dump_json())
@@ -179,8 +180,8 @@ def board_parts(root: Path, base: Path) -> list[Part]:
     start = card.extents(base)[0]
     regions = {"mbr+grub": start, "boot partition": (card.BOOT.start, card.BOOT.size)}
     parts = [part(name, base / "card.img", *region) for name, region in regions.items()]
-    files = ("vmlinuz", "initrd.img", "root.squashfs")
-    return parts + [part(name, root / name, 0, (root / name).stat().st_size) for name in files]
+    files = [root / name for name in ("vmlinuz", "initrd.img", "root.squashfs") if (root / name).exists()]
+    return parts + [part(file.name, file, 0, file.stat().st_size) for file in files]
 
 
 def packages(status: str) -> list[Package]:
@@ -311,9 +312,10 @@ def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
         for node in nodes
         for part in (f"{node.path} {node.mode:o} {node.uid} {node.gid}", node.content or b"", str(node.content is None))
     ]
+    own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
     return cache.digest(
-        *(lock.digest for lock in locks), paths.OVERLAY, images / "rootfs", images / "builder", images / "grub.cfg.j2",
-        paths.PROJECT / "requirements.lock", board.model_dump_json(), *identity,
+        *(lock.digest for lock in locks), *own_kernel, paths.OVERLAY, images / "rootfs", images / "builder",
+        images / "grub.cfg.j2", paths.PROJECT / "requirements.lock", board.model_dump_json(), *identity,
     )  # fmt: skip
 
 

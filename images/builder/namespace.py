@@ -6,10 +6,11 @@ it: when the builder dies, however it dies, the kernel ends the stage and takes 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from images.builder import paths, progress
@@ -75,8 +76,8 @@ def moved_clock() -> dict[str, str]:
     }
 
 
-def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
-    """Run `python -m module arguments` in namespaces; its output goes to `log`, whose end is shown on failure."""
+def run_stage(module: str, arguments: Sequence[str], log: Path, watch: Callable[[], None] = lambda: None) -> None:
+    """Run `python -m module arguments` in namespaces, as `run_logged` does."""
     argv = [*prefix(), sys.executable, "-m", module, *arguments]
     environment = {
         "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
@@ -85,16 +86,29 @@ def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
         "PYTHONPATH": str(paths.PROJECT),
     }
     environment |= {name: os.environ[name] for name in ("BUILD", "V") if name in os.environ} | moved_clock()
-    run_logged(module, argv, log, environment)
+    run_logged(module, argv, log, environment, watch)
 
 
-def run_logged(title: str, argv: Sequence[str], log: Path, environment: Mapping[str, str] = os.environ) -> None:
-    """Run a command that ends with the builder; its output goes to `log`, whose end is shown on failure."""
+def run_logged(
+    title: str,
+    argv: Sequence[str],
+    log: Path,
+    environment: Mapping[str, str] = os.environ,
+    watch: Callable[[], None] = lambda: None,
+) -> None:
+    """Run a command that ends with the builder; its output goes to `log`, whose end is shown on failure.
+
+    `watch` is called about once a second meanwhile, to show how far it is.
+    """
     progress.command(argv)
     with log.open("wb") as output:
         process = subprocess.Popen(argv, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
         try:
-            status = process.wait()
+            while True:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    status = process.wait(timeout=1)
+                    break
+                watch()
         finally:
             process.kill()
     if status != 0:

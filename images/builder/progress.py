@@ -38,6 +38,10 @@ class Step:
         percent = 100 * done // total if total else 100
         _line(f"{self.title} … {percent} % of {total} {unit}".rstrip(), keep=False)
 
+    def note(self, text: str) -> None:
+        """Show how far it is where nobody knows the whole; only a terminal sees it."""
+        _line(f"{self.title} … {text}, {time.monotonic() - self.started:.0f} s", keep=False)
+
 
 @contextmanager
 def step(title: str) -> Iterator[Step]:

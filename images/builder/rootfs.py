@@ -19,7 +19,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from images.builder import cache, initramfs, namespace, paths, pool, progress, tools
+from images.builder import cache, initramfs, kernel, namespace, paths, pool, progress, tools
+from images.builder.chroot import Chroot, mount
 from images.builder.fleet import Board
 from images.builder.lock import Lock
 
@@ -28,15 +29,22 @@ COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-
 """zstd: a Pentium III unpacks it several times faster than xz, at about 8 % more bytes. A boot reads hundreds of small
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
 _SIZE_LIMIT = "3g"
-_STAGE_FILES = ("rootfs.py", "initramfs.py", "init")
+_STAGE_FILES = ("rootfs.py", "chroot.py", "initramfs.py", "init")
 
 
 def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
-    """Directory with `root.squashfs`, `vmlinuz`, `initrd.img` and `contents.json` of the board's robots."""
+    """Directory with `root.squashfs`, `vmlinuz` and `contents.json` of the board's robots.
+
+    Debian's kernel needs an `initrd.img` too; ours holds what a boot needs.
+    """
+    own = kernel.build(board.name) if board.kernel == "lean" else None
+    if own:
+        lock = lock.without("kernel")
     sources = [Path(__file__).parent / name for name in _STAGE_FILES]
     key = cache.digest(
         lock.digest,
         tools_lock.digest,
+        own.directory.name if own else "",
         board.model_dump_json(include={"disk_modules", "architecture"}),
         _DATA,
         *sources,
@@ -50,12 +58,16 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
         with progress.step(f"{title} ({len(lock.packages)} packages)"):
             repository = out / "repository"
             pool.repository(lock, repository)
+            kernels = [package.path for package in lock.having("kernel")]
+            if own:
+                shutil.copy(own.package, repository)
+                kernels = [own.package.name]
             stage = {
                 "architecture": lock.architecture,
                 "epoch": lock.epoch,
                 "packages": [package.name for package in lock.having("required", "userland")],
-                "kernels": [package.path for package in lock.having("kernel")],
-                "disk_modules": board.disk_modules,
+                "kernels": kernels,
+                "disk_modules": None if own else board.disk_modules,
                 "tools": str(toolset),
                 "repository": str(repository),
                 "out": str(out),
@@ -83,40 +95,22 @@ class Stage:
         self.tools = Path(str(description["tools"]))
         self.target = self.tools / "target"
         self.epoch = int(str(description["epoch"]))
-        self.environment = {
-            "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
-            "LC_ALL": "C.UTF-8",
-            "TZ": "UTC",
-            "HOME": "/root",
-            "SOURCE_DATE_EPOCH": str(self.epoch),
-            "DEBIAN_FRONTEND": "noninteractive",
-            "DEBCONF_NONINTERACTIVE_SEEN": "true",
-            "container": "lxc",  # debootstrap then binds device nodes where it may not make them
-        }
-        self.clock: list[str] = []
-        if "FAKETIME_LIBRARIES" in os.environ:  # make verify; `env`, because the place exists inside the chroot only
-            moved = namespace.moved_clock() | {"LD_PRELOAD": "/run/faketime/$LIB/libfaketime.so.1"}
-            self.clock = ["env", *(f"{name}={value}" for name, value in moved.items())]
+        self._tools = Chroot(self.tools, self.epoch)
+        self._target = Chroot(self.target, self.epoch)
+        for each in (self._tools, self._target):
+            each.environment |= {
+                "DEBIAN_FRONTEND": "noninteractive",
+                "DEBCONF_NONINTERACTIVE_SEEN": "true",
+                "container": "lxc",  # debootstrap then binds device nodes where it may not make them
+            }
+        self.in_tools = self._tools.run
+        self.in_target = self._target.run
 
-    def run(self, root: Path, *argv: str) -> str:
-        print("+", *argv, flush=True)
-        done = subprocess.run(
-            ["chroot", str(root), *self.clock, *argv], env=self.environment, stdout=subprocess.PIPE, text=True
-        )
-        print(done.stdout, flush=True)
-        if done.returncode != 0:
-            raise SystemExit(f"{argv[0]} failed with status {done.returncode}")
-        return done.stdout
-
-    def in_tools(self, *argv: str) -> str:
-        return self.run(self.tools, *argv)
-
-    def in_target(self, *argv: str) -> str:
-        return self.run(self.target, *argv)
-
-
-def _mount(*arguments: str) -> None:
-    subprocess.run(["mount", *arguments], check=True)
+    def mount(self, repository: str, out: str) -> None:
+        """All inside the private mount namespace: nothing to undo."""
+        mount("-t", "tmpfs", "-o", f"mode=755,size={_SIZE_LIMIT}", "flotilla", self.target)
+        self._tools.provide_system(repository=repository, out=out)
+        self._target.provide_clock()
 
 
 @contextlib.contextmanager
@@ -127,32 +121,13 @@ def _timed(title: str) -> Iterator[None]:
     print(f"== {title}: {time.monotonic() - started:.1f} s", flush=True)
 
 
-def _mounts(stage: Stage, repository: str, out: str) -> None:
-    """All inside the private mount namespace: nothing to undo."""
-    root = stage.tools
-    _mount("-t", "tmpfs", "-o", f"mode=755,size={_SIZE_LIMIT}", "flotilla", str(stage.target))
-    for name in ("tmp", "run", "dev"):
-        _mount("-t", "tmpfs", "-o", "mode=755", "flotilla", str(root / name))
-    for node in ("null", "zero", "full", "random", "urandom", "tty"):
-        (root / "dev" / node).touch()
-        _mount("--bind", f"/dev/{node}", str(root / "dev" / node))
-    _mount("-t", "proc", "proc", str(root / "proc"))
-    _mount("--bind", repository, str(root / "repository"))
-    _mount("--bind", out, str(root / "out"))
-    if stage.clock:
-        for chroot in (root, stage.target):
-            (chroot / "dev/shm").mkdir(parents=True)  # libfaketime insists on semaphores
-            (chroot / "run/faketime").mkdir(parents=True)
-            _mount("--bind", os.environ["FAKETIME_LIBRARIES"], str(chroot / "run/faketime"))
-
-
 def main(description_file: str) -> None:
     """The stage: everything from an empty directory to the packed root."""
     description = json.loads(Path(description_file).read_text())
     os.umask(0o022)
     os.nice(5)
     stage = Stage(description)
-    _mounts(stage, description["repository"], description["out"])
+    stage.mount(description["repository"], description["out"])
     print(f"clock of the stage: {time.strftime('%F')}")
     stage.in_tools("date", "+clock of the tools: %F")
     with _timed("debootstrap"):
@@ -167,13 +142,14 @@ def main(description_file: str) -> None:
     with _timed("clean"):
         contents = _clean(stage)
     out = Path(description["out"])
-    with _timed("initramfs"):
-        image = initramfs.build(stage.tools, stage.target, version, description["disk_modules"])
-        (stage.tools / "tmp/initrd").write_bytes(image)
-        stage.in_tools("zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img")
-        shutil.move(stage.target / "boot" / f"vmlinuz-{version}", out / "vmlinuz")
-        shutil.rmtree(stage.target / "boot")
-        (stage.target / "boot").mkdir()
+    if description["disk_modules"] is not None:
+        with _timed("initramfs"):
+            image = initramfs.build(stage.tools, stage.target, version, description["disk_modules"])
+            (stage.tools / "tmp/initrd").write_bytes(image)
+            stage.in_tools("zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img")
+    shutil.move(stage.target / "boot" / f"vmlinuz-{version}", out / "vmlinuz")
+    shutil.rmtree(stage.target / "boot")
+    (stage.target / "boot").mkdir()
     with _timed("squashfs"):
         _settle_times(stage)
         stage.in_tools(

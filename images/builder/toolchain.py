@@ -1,0 +1,49 @@
+"""Programs for robots, compiled by the locked compiler: the same bytes on every development computer."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from images.builder import namespace, paths, pool, tools
+from images.builder.chroot import Chroot
+from images.builder.lock import read_lock
+
+_ARCHITECTURES = {
+    # The kernel's headers are for both, at the place for one.
+    "i386": ["-m32", "-march=pentium3", "-isystem", "/usr/include/x86_64-linux-gnu"],
+    "amd64": ["-m64"],
+}
+"""Options by Debian's name of the architecture. The oldest i386 boards are of the Pentium III class."""
+_OPTIONS = ["-O2", "-Wl,--build-id=none", "-s"]
+
+
+def compile_static(source: Path, architecture: str, options: Sequence[str] = ()) -> bytes:
+    """A C file as a program that needs nothing of the robot's libraries; errors are the compiler's own words."""
+    lock = read_lock("toolchain")
+    pool.fill([lock])
+    toolchain = tools.tree(lock)
+    paths.BUILD.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".compile-") as work:
+        shutil.copy(source, work)
+        command = ["gcc-12", *_ARCHITECTURES[architecture], *_OPTIONS, "-static", *options]
+        command += ["-o", "/out/program", f"/out/{source.name}"]
+        stage = {"tools": str(toolchain), "epoch": lock.epoch, "out": work, "command": command}
+        namespace.run_stage(__name__, [json.dumps(stage)], Path(work) / "log")
+        return (Path(work) / "program").read_bytes()
+
+
+def main(description: str) -> None:
+    """The stage: one command in a chroot of the toolchain."""
+    stage = json.loads(description)
+    chroot = Chroot(Path(stage["tools"]), stage["epoch"])
+    chroot.provide_system(out=stage["out"])
+    chroot.log(*stage["command"])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

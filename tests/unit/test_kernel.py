@@ -1,0 +1,127 @@
+"""Kernel configuration: what a fragment may say, and that nothing asked for is dropped silently.
+
+Seen to fail: each message by leaving out the check it comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from images.builder import kernel
+from images.builder.errors import ProblemsError, UserError
+from images.builder.kernel import Option
+from images.builder.lock import read_lock
+
+KCONFIG = """\
+config PREEMPT_RT
+\tbool "Fully Preemptible Kernel (Real-Time)"
+\tdepends on EXPERT && ARCH_SUPPORTS_RT
+
+menuconfig SERIAL_8250
+\ttristate "8250/16550"
+
+config E100
+\ttristate "Intel(R) PRO/100+ support"
+\tdepends on PCI
+\tselect MII
+"""
+
+
+def option(name: str, value: str = "y", place: str = "kernel/fragments/a.config:1") -> Option:
+    return Option(name, value, "because", place)
+
+
+@pytest.fixture
+def fragment(tmp_path: Path) -> Callable[[str], Path]:
+    def write(text: str) -> Path:
+        path = tmp_path / "some.config"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_fragment(fragment: Callable[[str], Path]) -> None:
+    path = fragment('# About.\n\nCONFIG_A=y # needed\nCONFIG_B="x # y" # named\nCONFIG_C=16 # many\n')
+    found = [(each.name, each.value, each.reason) for each in kernel.read_fragment(path)]
+    assert found == [("A", "y", "needed"), ("B", '"x # y"', "named"), ("C", "16", "many")]
+
+
+def test_every_malformed_line_is_reported(fragment: Callable[[str], Path]) -> None:
+    path = fragment("CONFIG_A=y\nCONFIG_B=y # good\nB=y # no prefix\n")
+    with pytest.raises(ProblemsError) as caught:
+        kernel.read_fragment(path)
+    assert [problem.file for problem in caught.value.problems] == [f"{path}:1", f"{path}:3"]
+    assert "write `CONFIG_NAME=value # reason`" in str(caught.value)
+
+
+def test_missing_fragment_names_those_that_exist(fragment: Callable[[str], Path]) -> None:
+    path = fragment("")
+    with pytest.raises(UserError, match=r"other\.config: no such fragment; there are some"):
+        kernel.read_fragment(path.with_name("other.config"))
+
+
+def test_contradiction_names_both_places() -> None:
+    first, second = option("SMP", "y"), option("SMP", "n", "kernel/fragments/b.config:7")
+    with pytest.raises(ProblemsError) as caught:
+        kernel.merge([first, second])
+    assert str(caught.value) == (
+        "kernel/fragments/b.config:7: CONFIG_SMP: n: contradicts kernel/fragments/a.config:1, which says y; "
+        "keep one of them"
+    )
+
+
+def test_same_option_twice_is_no_contradiction() -> None:
+    assert kernel.merge([option("SMP"), option("SMP", place="kernel/fragments/b.config:7")]) == {"SMP": option("SMP")}
+
+
+def test_request() -> None:
+    options = [option("SMP", "n"), option("NR", "16")]
+    assert kernel.request(options) == "CONFIG_NR=16\n# CONFIG_SMP is not set\n"
+
+
+def test_final_configuration_as_asked() -> None:
+    config = "CONFIG_SERIAL_8250=y\nCONFIG_E100=m\n# CONFIG_PREEMPT_RT is not set\n"
+    options = [option("SERIAL_8250"), option("E100", "m"), option("PREEMPT_RT", "n"), option("ABSENT", "n")]
+    assert kernel.compare(options, config, KCONFIG) == []
+
+
+def test_misspelt_option() -> None:
+    (problem,) = kernel.compare([option("PREEMPT_TR")], "", KCONFIG)
+    assert str(problem) == (
+        "kernel/fragments/a.config:1: CONFIG_PREEMPT_TR: y: is no option of this kernel; "
+        "perhaps CONFIG_PREEMPT_RT is meant"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "message"),
+    [
+        ("PREEMPT_RT", "", "is refused by kconfig, which makes it n; it depends on EXPERT && ARCH_SUPPORTS_RT"),
+        ("E100", "CONFIG_E100=m\n", "is refused by kconfig, which makes it m; it depends on PCI"),
+        ("SERIAL_8250", "", "is refused by kconfig, which makes it n; another option selects or forbids it"),
+    ],
+)
+def test_refused_option(name: str, config: str, message: str) -> None:
+    (problem,) = kernel.compare([option(name)], config, KCONFIG)
+    assert message in str(problem)
+
+
+def test_missing_source() -> None:
+    packages = [package for package in read_lock("toolchain").packages if not package.name.startswith("linux-source")]
+    with pytest.raises(UserError, match=r"no package linux-source-….*make lock"):
+        kernel.source(packages)
+
+
+def test_unknown_kernel() -> None:
+    with pytest.raises(UserError, match="no kernel 'smartcore'; there are smartcoret3, "):
+        kernel.wanted("smartcore")
+
+
+@pytest.mark.parametrize("name", kernel.recipes())
+def test_fragments_of_every_kernel_agree(name: str) -> None:
+    options = kernel.wanted(name)
+    assert options["SQUASHFS"].value == "y", "a boot without initramfs mounts its root by itself"
