@@ -15,7 +15,7 @@ from images.builder.boot import DIE_WITH_PARENT
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
 from tests.conftest import GuestFactory
-from tests.latency import gate, machine, report, run, target
+from tests.latency import gate, machine, report, run, subject, target
 from tests.latency.results import Latency, Results
 
 pytestmark = pytest.mark.boot
@@ -25,8 +25,11 @@ BOARD = "smartcoret3"
 
 @contextlib.contextmanager
 def busy_host() -> Iterator[None]:
-    """A process for each processor that only computes, for as long as the body takes."""
-    argv = [*DIE_WITH_PARENT, sys.executable, "-c", "while True: pass"]
+    """A process for each processor that only computes, for as long as the body takes.
+
+    It is nice: QEMU's two threads hand over thousands of times a second, and would take ten times as long, not twice.
+    """
+    argv = [*DIE_WITH_PARENT, "nice", "-n", "10", sys.executable, "-c", "while True: pass"]
     hogs = [subprocess.Popen(argv) for _ in range(os.cpu_count() or 1)]
     try:
         yield
@@ -58,7 +61,7 @@ def test_a_run_repeats_to_the_byte_on_a_busy_host(measured: Results, board: Boar
 def test_the_loads_are_loads(measured: Results) -> None:
     busy = {name: outcome.activity.busy_percent for name, outcome in measured.scenarios.items() if outcome.activity}
     assert busy["idle"] < 50
-    assert busy["scheduler"] > 95
+    assert busy["scheduler"] > 90
 
 
 def test_the_system_is_up_as_shipped(measured: Results) -> None:
@@ -98,9 +101,9 @@ def test_the_same_scenarios_on_a_robot_in_real_time(
 
 
 def test_a_guest_that_does_not_end_is_ended(board: Board, tmp_path: Path) -> None:
-    """A kernel that is none: the BIOS waits for ever."""
-    kernel = tmp_path / "vmlinuz"
-    kernel.write_bytes(b"\xeb\xfe".ljust(512, b"\0"))
-    guest = machine.Machine(board, kernel, kernel, ())
+    """A kernel without a root, told to stand still when it panics."""
+    initrd = tmp_path / "initrd.img"
+    initrd.write_bytes(bytes(512))
+    guest = machine.Machine(board, subject.build(board).kernel, initrd, ("panic=0",))
     with pytest.raises(UserError, match="the guest did not end within 3 s"):
         guest.run(tmp_path, 3)

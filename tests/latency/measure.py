@@ -47,11 +47,16 @@ def loaded(loads: list[list[str]]) -> Iterator[None]:
 
 
 def counters() -> dict[str, float]:
-    """How much the system has done since it started: what a load really does is the difference of two."""
+    """How much the system has done since it started: what a load really does is the difference of two.
+
+    Not the idle time of /proc/stat: it is sampled by the tick, and a thread that wakes in step with it seems to run
+    always, or never.
+    """
     rows = [line.split() for line in Path("/proc/stat").read_text().splitlines()]
     lines = {name: [int(value) for value in values] for name, *values in rows}
+    usage = Path("/sys/fs/cgroup/system.slice/cpu.stat").read_text().split()
     return {
-        "idle_s": (lines["cpu"][3] + lines["cpu"][4]) / os.sysconf("SC_CLK_TCK"),
+        "services_s": int(usage[usage.index("usage_usec") + 1]) / 1e6,
         "interrupts": lines["intr"][0],
         "context_switches": lines["ctxt"][0],
         "elapsed_s": time.monotonic(),

@@ -64,6 +64,7 @@ class Activity(_Model):
     """What the whole system did while the scenario was measured: shows that a load was one."""
 
     busy_percent: float
+    """Processor time of all services, the measurement and its loads among them; threads of the kernel not counted."""
     interrupts_per_s: float
     context_switches_per_s: float
 
@@ -183,7 +184,7 @@ def outcome(scenario: Scenario, raw: Mapping[str, Any], samples: int) -> Outcome
         title=scenario.title,
         latencies=latencies,
         activity=Activity(
-            busy_percent=round(max(0.0, 100 - 100 * activity["idle_s"] / elapsed_s), 1),
+            busy_percent=round(100 * activity["services_s"] / elapsed_s, 1),
             interrupts_per_s=round(activity["interrupts"] / elapsed_s, 1),
             context_switches_per_s=round(activity["context_switches"] / elapsed_s, 1),
         ),
