@@ -60,10 +60,26 @@ check: | setup-tests ## lint, types and unit tests, under a minute
 test: | setup-tests ## everything: checks, images, boots in QEMU
 	$(Q)$(MAKE) check
 	$(Q)$(FLOTILLA) image --all
+	$(Q)$(FLOTILLA) kernel --board smartcoret3
 	$(Q)$(VENV)/bin/pytest tests
 
 bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
+
+##@ Real time
+.PHONY: latency latency-accept boot-time
+LATENCY = $(PYTHON) -m tests.latency
+# What is measured: the board's shipped system, or another kernel of it, or less of it, or a robot.
+measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--$(PLAN))
+latency: | setup-tests ## latency in virtual time against the accepted one [BOARD= KERNEL= PLAN=quick|disk]; or TARGET=ssh:robot3
+	$(Q)$(LATENCY) measure $(measured) $(if $(TARGET),--target $(TARGET))
+	$(if $(TARGET),,$(Q)$(LATENCY) compare $(measured))
+
+latency-accept: | setup-tests ## make the last latency run the accepted one
+	$(Q)$(LATENCY) accept $(measured)
+
+boot-time: | setup-tests ## where a boot spends its time, in virtual time
+	$(Q)$(LATENCY) boot-time $(measured)
 
 ##@ Housekeeping
 .PHONY: setup setup-tests clean help

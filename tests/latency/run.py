@@ -40,7 +40,7 @@ def measure(board: Board, plan: Plan, out: Path) -> Results:
     """Measure a board's system; `results.json` is in `out` when it is done."""
     measured = subject.build(board)
     out.mkdir(parents=True, exist_ok=True)
-    program = compiler.compile_static(subject.HERE / "serial_latency.c", board, out / "serial_latency")
+    program = compiler.compile_static(subject.HERE / "serial_latency.c", board)
     boots: dict[tuple[str, ...], list[Scenario]] = {}
     for scenario in planned(plan):
         boots.setdefault(scenario.without, []).append(scenario)
