@@ -38,7 +38,7 @@ def made(**changes: Any) -> Results:
 
 
 @pytest.mark.parametrize(
-    ("percent", "expected"), [(0.1, 1), (50, 1), (50.1, 2), (99, 2), (99.9, 3), (99.99, 4), (100, 4)]
+    ("percent", "expected"), [(0.1, 1), (50, 1), (50.1, 2), (50.005, 2), (99, 2), (99.9, 3), (99.99, 4), (100, 4)]
 )
 def test_percentile_is_by_nearest_rank(percent: float, expected: int) -> None:
     assert results.percentile({1: 5000, 2: 4900, 3: 90, 4: 10}, percent) == expected
