@@ -67,13 +67,16 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
 
 ##@ Real time
-.PHONY: latency latency-accept boot-time
+.PHONY: latency latency-accept boot-time hwcheck
 LATENCY = $(PYTHON) -m tests.latency
 # What is measured: the board's shipped system, or another kernel of it, or less of it, or a robot.
 measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--$(PLAN))
 latency: | setup-tests ## latency in virtual time against the accepted one [BOARD= KERNEL= PLAN=quick|disk]; or TARGET=ssh:robot3
 	$(Q)$(LATENCY) measure $(measured) $(if $(TARGET),--target $(TARGET))
 	$(if $(TARGET),,$(Q)$(LATENCY) compare $(measured))
+
+hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
+	$(Q)$(FLOTILLA) hwcheck --robot $(call need,ROBOT) $(if $(SECONDS),--seconds $(SECONDS))
 
 latency-accept: | setup-tests ## make the last latency run the accepted one
 	$(Q)$(LATENCY) accept $(measured)

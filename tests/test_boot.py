@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from images.builder import card, identity, paths, qemu, tools
+from images.builder import card, hwcheck, identity, paths, qemu, tools
 from images.builder.boot import ssh_options
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
@@ -470,6 +470,17 @@ def test_processor_stays_awake(robot: RobotGuest) -> None:
         assert sh(robot, read) != "0", "0 µs although nobody asks for it: the check is blind"
     finally:
         sh(robot, "systemctl start flotilla-dma-latency")
+
+
+def test_hardware_can_be_reported(robot: RobotGuest) -> None:
+    """What `make hwcheck` asks, every kernel and board can answer."""
+    found = hwcheck.parse(sh(robot, hwcheck.script(seconds=1)))
+    assert {name: text for name, (status, text) in found.items() if status and name != "hardware latency"} == {}
+    summary = hwcheck.summary(found).splitlines()
+    assert "tsc: yes" in summary
+    assert any(line.startswith("hardware latency: ") and "not measured" not in line for line in summary), summary
+    ports = {line.partition(":")[0] for line in summary if line.startswith("ttyS")}
+    assert ports == {port.tty for port in robot.board.ports.values()}
 
 
 def test_service_manager_feeds_the_watchdog(robot: RobotGuest) -> None:

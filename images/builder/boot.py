@@ -62,8 +62,7 @@ def boot(robot: Robot, board: Board, network: Network, image: Path, station: IPv
 def ssh(robot: Robot, command: Sequence[str] = ()) -> None:
     """Become `ssh` to the robot's guest when `make boot` runs, else to the robot."""
     port = forwarded_port(robot)
-    target = ["-p", str(port), "127.0.0.1"] if port else [str(robot.address)]
-    argv = ["ssh", *ssh_options(robot), *target, *command]
+    argv = [*ssh_command(robot), *command]
     progress.command(argv)
     sys.stderr.write(f"{robot.name}: {f'guest of make boot, port {port}' if port else f'robot at {robot.address}'}\n")
     sys.stderr.flush()
@@ -71,6 +70,12 @@ def ssh(robot: Robot, command: Sequence[str] = ()) -> None:
         os.execvp("ssh", argv)
     except FileNotFoundError as error:
         raise UserError("ssh is missing on this computer; install it: sudo apt-get install openssh-client") from error
+
+
+def ssh_command(robot: Robot) -> list[str]:
+    """`ssh` to the robot's guest when `make boot` runs, else to the robot."""
+    port = forwarded_port(robot)
+    return ["ssh", *ssh_options(robot), *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)])]
 
 
 def ssh_options(robot: Robot) -> list[str]:
