@@ -24,6 +24,9 @@ from typing import Any
 WARM_UP_S = 1.0
 """From the start of a load to that of a measurement, and after its end: no event says that a load is complete."""
 
+_END_S = 10.0
+"""For a load to end by itself; then it is killed."""
+
 
 @contextlib.contextmanager
 def loaded(loads: list[list[str]]) -> Iterator[None]:
@@ -39,10 +42,13 @@ def loaded(loads: list[list[str]]) -> Iterator[None]:
         if ended:
             raise RuntimeError(f"the load ended before the measurement: {ended}")
     finally:
-        for process in running:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        for number in (signal.SIGTERM, signal.SIGKILL):  # some have to set something right before they end
+            for process in running:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, number)
+            for process in running:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_END_S)
         time.sleep(WARM_UP_S)
 
 

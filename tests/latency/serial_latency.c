@@ -2,7 +2,7 @@
  * Time from the write of a byte to its arrival at a waiting thread, through a UART whose output is its own input.
  *
  *     serial_latency DEVICE COUNT   prints a histogram in microseconds, in the shape of cyclictest --json
- *     serial_latency DEVICE load    keeps the port as busy as 115200 Bd would, until it is killed
+ *     serial_latency DEVICE load    keeps the port as busy as 115200 Bd would, until SIGTERM
  *
  * The UART's loopback (MCR bit 4) needs no cable; nothing reaches the connector. One byte is under way at a time, every
  * PERIOD_NS. Both threads are SCHED_FIFO, above the interrupt threads, with their memory locked.
@@ -14,6 +14,7 @@
 #include <pthread.h>
 #include <sched.h>
 #include <semaphore.h>
+#include <signal.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -82,6 +83,16 @@ static void open_port(const char *path)
         fail("loopback");
 }
 
+/* A port that stays open elsewhere would stay in loopback. */
+static void leave(int unused)
+{
+    int loop = TIOCM_LOOP;
+
+    (void)unused;
+    ioctl(port, TIOCMBIC, &loop);
+    _exit(0);
+}
+
 static pthread_t start(void *(*body)(void *), int priority)
 {
     struct sched_param parameter = {.sched_priority = priority};
@@ -128,7 +139,9 @@ static void *send(void *unused)
         unsigned char byte = (unsigned char)sent;
         struct timespec deadline;
 
-        next_ns += PERIOD_NS;
+        do
+            next_ns += PERIOD_NS;
+        while (next_ns <= now_ns()); /* after a late byte: no burst */
         sleep_until(next_ns);
         written_ns = now_ns();
         if (write(port, &byte, 1) != 1)
@@ -183,6 +196,8 @@ int main(int argc, char **argv)
         return 2;
     }
     open_port(argv[1]);
+    signal(SIGTERM, leave);
+    signal(SIGINT, leave);
     if (mlockall(MCL_CURRENT | MCL_FUTURE))
         fail("mlockall");
     sem_init(&arrived, 0, 0);
@@ -194,5 +209,6 @@ int main(int argc, char **argv)
     start(receive, READER_PRIORITY);
     pthread_join(start(send, WRITER_PRIORITY), NULL);
     print();
-    return 0;
+    fflush(stdout);
+    leave(0);
 }
