@@ -227,7 +227,7 @@ def build(name: str) -> Kernel:
     return Kernel(cache.result("kernel", key, make))
 
 
-def _run(stage: kernel_stage.Description, what: str, log: Path, watch: Callable[[], None] | None = None) -> None:
+def _run(stage: kernel_stage.Description, what: str, log: Path, watch: Callable[[], object] | None = None) -> None:
     namespace.run_stage(kernel_stage.__name__, [what, json.dumps(stage.__dict__)], log, watch)
 
 

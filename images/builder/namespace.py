@@ -76,7 +76,7 @@ def moved_clock() -> dict[str, str]:
     }
 
 
-def run_stage(module: str, arguments: Sequence[str], log: Path, watch: Callable[[], None] | None = None) -> None:
+def run_stage(module: str, arguments: Sequence[str], log: Path, watch: Callable[[], object] | None = None) -> None:
     """Run `python -m module arguments` in namespaces, as `run_logged` does."""
     argv = [*prefix(), sys.executable, "-m", module, *arguments]
     environment = {
@@ -94,7 +94,7 @@ def run_logged(
     argv: Sequence[str],
     log: Path,
     environment: Mapping[str, str] = os.environ,
-    watch: Callable[[], None] | None = None,
+    watch: Callable[[], object] | None = None,
 ) -> None:
     """Run a command that ends with the builder; its output goes to `log`, whose end is shown on failure.
 
@@ -113,7 +113,7 @@ def run_logged(
         raise UserError(f"{title} failed (status {status}); the end of {paths.shown(log)}:\n{tail}")
 
 
-def _watch(process: subprocess.Popen[bytes], watch: Callable[[], None] | None) -> None:
+def _watch(process: subprocess.Popen[bytes], watch: Callable[[], object] | None) -> None:
     """Call `watch` each second until the process ends.
 
     By poll(2), not by a deadline: `make verify` moves the clock by which Popen.wait(timeout) would judge.

@@ -73,3 +73,11 @@ def test_a_user_without_a_range_is_told_how_to_get_one(monkeypatch: pytest.Monke
     message = str(namespace._refusal("newuidmap: uid range [1-65536) -> [100000-165535) not allowed"))
     assert message.startswith("/etc/subuid: no range for ada")
     assert "--add-subuids" in message
+
+
+def test_watch_is_called_while_a_command_runs(tmp_path: Path) -> None:
+    """The command ends because it is watched: without a call it would wait for ever."""
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+    namespace.run_logged("a command", ["cat", str(gate)], tmp_path / "log", watch=lambda: gate.write_text("seen"))
+    assert (tmp_path / "log").read_text() == "seen"
