@@ -19,7 +19,7 @@ CHECKS = {
     "interrupts": "cat /proc/interrupts",
     "I/O ports": "cat /proc/ioports",
     "PCI devices": "cat /proc/bus/pci/devices",
-    "serial ports": "cat /proc/tty/driver/serial; ls -l /dev/robot",
+    "serial ports": "ls -l /dev/robot; cat /proc/tty/driver/serial",
     "disks": "lsblk -o NAME,SIZE,MODEL,FSTYPE,MOUNTPOINTS",
     "network": "ip -s address",
     "failed units": "systemctl --failed --no-pager",
