@@ -64,8 +64,9 @@ def running(build: Path) -> Iterator[subprocess.Popen[str]]:
     """A build in the middle of debootstrap."""
     argv, environment = _argv(build)
     process = subprocess.Popen(
-        argv, env=environment, cwd=paths.PROJECT, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+        ["env", "--default-signal=INT", *argv],  # background jobs of a script inherit that it is ignored
+        env=environment, cwd=paths.PROJECT, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
     log = build / "rootfs-smartcoret3.log"
     timer = select.poll()  # waits for the process's end, and wakes now and then to look at the log
     descriptor = os.pidfd_open(process.pid)
