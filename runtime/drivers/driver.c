@@ -1,0 +1,75 @@
+#define _GNU_SOURCE
+#include "executive/service.h"
+
+#include <errno.h>
+#include <flotilla/driver.h>
+#include <poll.h>
+#include <pthread.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <unistd.h>
+
+struct fl_driver {
+    pthread_t thread;
+    int stop_fd;
+    void (*run)(struct fl_driver *driver, void *context);
+    void *context;
+};
+
+static void *enter(void *argument)
+{
+    struct fl_driver *driver = argument;
+    driver->run(driver, driver->context);
+    return NULL;
+}
+
+struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
+                                  void *context)
+{
+    struct fl_driver *driver = fl_allocate(block, sizeof *driver);
+    if (!driver)
+        return NULL;
+    driver->run = run;
+    driver->context = context;
+    driver->stop_fd = eventfd(0, EFD_CLOEXEC);
+    if (driver->stop_fd < 0) {
+        fl_fail(block, "eventfd: %s", strerror(errno));
+        return NULL;
+    }
+    int error = fl_service_thread(block->service, &driver->thread, block->name, enter, driver);
+    if (error) {
+        close(driver->stop_fd);
+        fl_fail(block, "cannot start the driver's thread: %s", strerror(error));
+        return NULL;
+    }
+    return driver;
+}
+
+void fl_driver_stop(struct fl_driver *driver)
+{
+    if (!driver)
+        return;
+    eventfd_write(driver->stop_fd, 1);
+    pthread_join(driver->thread, NULL);
+    close(driver->stop_fd);
+}
+
+int fl_driver_stop_fd(const struct fl_driver *driver)
+{
+    return driver->stop_fd;
+}
+
+int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int timeout_ms)
+{
+    struct pollfd waiting[] = {{.fd = driver->stop_fd, .events = POLLIN},
+                               {.fd = fd, .events = writable ? POLLOUT : POLLIN}};
+    int ready = poll(waiting, 2, timeout_ms);
+    if (ready < 0)
+        return errno == EINTR ? 0 : -2;
+    if (waiting[0].revents)
+        return -1;
+    /* Bytes that came before the hang-up are still read. */
+    if (waiting[1].revents & (POLLIN | POLLOUT))
+        return 1;
+    return waiting[1].revents ? -2 : 0;
+}

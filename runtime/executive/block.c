@@ -1,0 +1,188 @@
+/* Instances of blocks: memory, failures, ports. */
+#define _GNU_SOURCE
+#include "block.h"
+
+#include <errno.h>
+#include <flotilla/block.h>
+#include <sched.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+static const struct {
+    const char *name;
+    size_t size;
+} types[FL_TYPES] = {
+    [FL_BOOLEAN] = {"boolean", 1}, [FL_INT8] = {"int8", 1},     [FL_UINT8] = {"uint8", 1},   [FL_INT16] = {"int16", 2},
+    [FL_UINT16] = {"uint16", 2},   [FL_INT32] = {"int32", 4},   [FL_UINT32] = {"uint32", 4}, [FL_INT64] = {"int64", 8},
+    [FL_UINT64] = {"uint64", 8},   [FL_SINGLE] = {"single", 4}, [FL_DOUBLE] = {"double", 8},
+};
+
+size_t fl_type_size(enum fl_type type)
+{
+    return types[type].size;
+}
+
+const char *fl_type_name(enum fl_type type)
+{
+    return types[type].name;
+}
+
+int fl_type_named(const char *name)
+{
+    for (int type = 0; type < FL_TYPES; type++)
+        if (strcmp(types[type].name, name) == 0)
+            return type;
+    return -1;
+}
+
+int64_t fl_now_ns(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+}
+
+enum { LINE = 64 }; /* bytes of a cache line: rings keep their two ends on lines of their own */
+
+void *fl_allocate(struct fl_block *block, size_t bytes)
+{
+    size_t rounded = LINE + (bytes + LINE - 1) / LINE * LINE;
+    struct fl_memory *memory = bytes < SIZE_MAX - 2 * (size_t)LINE ? aligned_alloc(LINE, rounded) : NULL;
+    if (!memory) {
+        fl_fail(block, "no memory for %zu bytes", bytes);
+        return NULL;
+    }
+    memset(memory, 0, rounded);
+    memory->next = block->service->memory;
+    block->service->memory = memory;
+    return (char *)memory + LINE;
+}
+
+int fl_fail(struct fl_block *block, const char *format, ...)
+{
+    va_list arguments;
+    va_start(arguments, format);
+    vsnprintf(block->service->failure, sizeof block->service->failure, format, arguments);
+    va_end(arguments);
+    return FL_FAILED;
+}
+
+void fl_log(struct fl_block *block, const char *format, ...)
+{
+    char line[256];
+    va_list arguments;
+    va_start(arguments, format);
+    vsnprintf(line, sizeof line, format, arguments);
+    va_end(arguments);
+    fprintf(stderr, "%s: %s\n", block->name, line);
+}
+
+static int add_port(struct fl_block *block, struct fl_port **ports, uint32_t *count, struct fl_port port)
+{
+    struct fl_port *more = fl_allocate(block, sizeof port * (*count + 1));
+    if (!more)
+        return FL_FAILED;
+    if (*count)
+        memcpy(more, *ports, sizeof port * *count);
+    more[(*count)++] = port;
+    *ports = more;
+    return FL_OK;
+}
+
+int fl_add_input(struct fl_block *block, struct fl_port port)
+{
+    int result = add_port(block, &block->service->in_ports, &block->in_count, port);
+    block->in_ports = block->service->in_ports;
+    return result;
+}
+
+int fl_add_output(struct fl_block *block, struct fl_port port)
+{
+    int result = add_port(block, &block->service->out_ports, &block->out_count, port);
+    block->out_ports = block->service->out_ports;
+    return result;
+}
+
+struct fl_block *block_create(const struct fl_block_type *type, const char *name)
+{
+    struct fl_block *block = calloc(1, sizeof *block);
+    struct fl_service *service = calloc(1, sizeof *service);
+    char *copy = strdup(name);
+    if (!block || !service || !copy)
+        abort();
+    block->type = type;
+    block->name = copy;
+    block->service = service;
+    block->parameters = fl_allocate(block, type->parameters_size + 1);
+    block->state = fl_allocate(block, type->state_size + 1);
+    int failed = 0;
+    for (uint32_t i = 0; i < type->input_count; i++)
+        failed |= fl_add_input(block, type->inputs[i]);
+    for (uint32_t i = 0; i < type->output_count; i++)
+        failed |= fl_add_output(block, type->outputs[i]);
+    if (!block->parameters || !block->state || failed)
+        abort();
+    return block;
+}
+
+int block_make_signals(struct fl_block *block)
+{
+    void **out = fl_allocate(block, sizeof(void *) * (block->out_count + 1));
+    const void **in = fl_allocate(block, sizeof(void *) * (block->in_count + 1));
+    if (!out || !in)
+        return FL_FAILED;
+    for (uint32_t i = 0; i < block->out_count; i++)
+        if (!(out[i] = fl_allocate(block, fl_type_size(block->out_ports[i].type) * block->out_ports[i].width)))
+            return FL_FAILED;
+    /* What stays without a wire reads zero. */
+    for (uint32_t i = 0; i < block->in_count; i++)
+        if (!(in[i] = fl_allocate(block, fl_type_size(block->in_ports[i].type) * block->in_ports[i].width)))
+            return FL_FAILED;
+    block->out = out;
+    block->in = in;
+    return FL_OK;
+}
+
+void block_wire(struct fl_block *block, uint32_t port, const void *signal)
+{
+    ((const void **)(uintptr_t)block->in)[port] = signal;
+}
+
+void block_destroy(struct fl_block *block)
+{
+    if (!block)
+        return;
+    for (struct fl_memory *memory = block->service->memory, *next; memory; memory = next) {
+        next = memory->next;
+        free(memory);
+    }
+    free(block->service);
+    free((char *)(uintptr_t)block->name);
+    free(block);
+}
+
+int fl_service_thread(struct fl_service *service, pthread_t *thread, const char *name, void *(*enter)(void *),
+                      void *argument)
+{
+    pthread_attr_t attributes;
+    int error = pthread_attr_init(&attributes);
+    if (error)
+        return error;
+    pthread_attr_setstacksize(&attributes, 256 * 1024);
+    if (service->priority) {
+        pthread_attr_setinheritsched(&attributes, PTHREAD_EXPLICIT_SCHED);
+        pthread_attr_setschedpolicy(&attributes, SCHED_FIFO);
+        pthread_attr_setschedparam(&attributes, &(struct sched_param){.sched_priority = service->priority});
+    }
+    error = pthread_create(thread, &attributes, enter, argument);
+    pthread_attr_destroy(&attributes);
+    if (!error) {
+        char shown[16];
+        snprintf(shown, sizeof shown, "%s", name);
+        pthread_setname_np(*thread, shown);
+    }
+    return error;
+}

@@ -1,0 +1,254 @@
+#include "parameter.h"
+
+#include <ctype.h>
+#include <errno.h>
+#include <inttypes.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+static const char *const kind_names[] = {
+    [FL_KIND_BOOLEAN] = "true or false",
+    [FL_KIND_INTEGER] = "a whole number",
+    [FL_KIND_REAL] = "a number",
+    [FL_KIND_TEXT] = "a text",
+    [FL_KIND_REALS] = "a list of numbers",
+    [FL_KIND_TEXTS] = "a list of texts",
+    [FL_KIND_CHOICE] = "one of its choices",
+    [FL_KIND_DEVICE] = "a device's path",
+};
+
+bool read_integer(const char *text, int64_t *value)
+{
+    char *end;
+    const char *digits = text + (*text == '-' || *text == '+');
+    bool hexadecimal = digits[0] == '0' && (digits[1] == 'x' || digits[1] == 'X');
+    if (!isdigit((unsigned char)*digits))
+        return false;
+    errno = 0;
+    long long read = strtoll(text, &end, hexadecimal ? 16 : 10);
+    if (errno || *end)
+        return false;
+    *value = read;
+    return true;
+}
+
+bool read_real(const char *text, double *value)
+{
+    char *end;
+    if (!*text || isspace((unsigned char)*text))
+        return false;
+    errno = 0;
+    double read = strtod(text, &end);
+    if (*end || !isfinite(read))
+        return false;
+    *value = read;
+    return true;
+}
+
+bool read_duration(const char *text, int64_t *value_ns)
+{
+    static const struct {
+        const char *unit;
+        double ns;
+    } units[] = {{"ns", 1}, {"us", 1e3}, {"µs", 1e3}, {"ms", 1e6}, {"s", 1e9}};
+    char *end;
+    double number = strtod(text, &end);
+    if (end == text || !isfinite(number) || fabs(number) > 1e9)
+        return false;
+    while (*end == ' ')
+        end++;
+    for (size_t i = 0; i < sizeof units / sizeof units[0]; i++) {
+        if (strcmp(end, units[i].unit) == 0) {
+            *value_ns = (int64_t)llround(number * units[i].ns);
+            return true;
+        }
+    }
+    return false;
+}
+
+static bool read_boolean(const char *text, bool *value)
+{
+    *value = strcmp(text, "true") == 0;
+    return *value || strcmp(text, "false") == 0;
+}
+
+static int choice_named(const char *choices, const char *name)
+{
+    size_t length = strlen(name);
+    for (int index = 0;; index++) {
+        size_t until = strcspn(choices, "|");
+        if (until == length && strncmp(choices, name, length) == 0)
+            return index;
+        if (!choices[until])
+            return -1;
+        choices += until + 1;
+    }
+}
+
+static bool in_range(const struct fl_parameter *parameter, double value)
+{
+    return parameter->min == parameter->max || (value >= parameter->min && value <= parameter->max);
+}
+
+static const char *kept(struct fl_block *block, const char *text)
+{
+    size_t bytes = strlen(text) + 1;
+    char *copy = fl_allocate(block, bytes);
+    return copy ? memcpy(copy, text, bytes) : NULL;
+}
+
+static bool read_reals(struct fl_block *block, const struct fl_parameter *parameter, const struct written *value,
+                       struct fl_reals *reals, bool *out_of_range)
+{
+    double *numbers = fl_allocate(block, sizeof(double) * (value->count + 1));
+    if (!numbers)
+        return false;
+    for (size_t i = 0; i < value->count; i++) {
+        if (!read_real(value->text[i], &numbers[i]))
+            return false;
+        if (!in_range(parameter, numbers[i]))
+            *out_of_range = true;
+    }
+    *reals = (struct fl_reals){value->count, numbers};
+    return true;
+}
+
+static bool read_texts(struct fl_block *block, const struct written *value, struct fl_texts *texts)
+{
+    const char **copies = fl_allocate(block, sizeof(char *) * (value->count + 1));
+    if (!copies)
+        return false;
+    for (size_t i = 0; i < value->count; i++)
+        if (!(copies[i] = kept(block, value->text[i])))
+            return false;
+    *texts = (struct fl_texts){value->count, copies};
+    return true;
+}
+
+/* Into a place of the kind's C type. */
+static bool read_kind(struct fl_block *block, const struct fl_parameter *parameter, const struct written *value,
+                      void *place, bool *out_of_range)
+{
+    const char *text = value->count ? value->text[0] : "";
+    if (value->list && parameter->kind != FL_KIND_REALS && parameter->kind != FL_KIND_TEXTS)
+        return false;
+    switch (parameter->kind) {
+    case FL_KIND_BOOLEAN:
+        return read_boolean(text, place);
+    case FL_KIND_INTEGER:
+        if (!read_integer(text, place))
+            return false;
+        *out_of_range = !in_range(parameter, (double)*(int64_t *)place);
+        return true;
+    case FL_KIND_REAL:
+        if (!read_real(text, place))
+            return false;
+        *out_of_range = !in_range(parameter, *(double *)place);
+        return true;
+    case FL_KIND_TEXT:
+        return (*(const char **)place = kept(block, text)) != NULL;
+    case FL_KIND_DEVICE:
+        return *text == '/' && (((struct fl_device *)place)->path = kept(block, text)) != NULL;
+    case FL_KIND_CHOICE:
+        return (*(int *)place = choice_named(parameter->choices, text)) >= 0;
+    case FL_KIND_REALS:
+        return read_reals(block, parameter, value, place, out_of_range);
+    case FL_KIND_TEXTS:
+        return read_texts(block, value, place);
+    }
+    return false;
+}
+
+static size_t kind_size(enum fl_kind kind)
+{
+    static const size_t sizes[] = {
+        [FL_KIND_BOOLEAN] = sizeof(bool),
+        [FL_KIND_INTEGER] = sizeof(int64_t),
+        [FL_KIND_REAL] = sizeof(double),
+        [FL_KIND_TEXT] = sizeof(const char *),
+        [FL_KIND_REALS] = sizeof(struct fl_reals),
+        [FL_KIND_TEXTS] = sizeof(struct fl_texts),
+        [FL_KIND_CHOICE] = sizeof(int),
+        [FL_KIND_DEVICE] = sizeof(struct fl_device),
+    };
+    return sizes[kind];
+}
+
+bool parameter_set(struct fl_block *block, const struct fl_parameter *parameter, void *parameters,
+                   const struct written *value, char *reason, size_t reason_size)
+{
+    union {
+        bool boolean;
+        int64_t integer;
+        double real;
+        struct fl_reals reals;
+        int choice;
+        const char *text;
+    } place = {.integer = 0};
+    bool out_of_range = false;
+    const char *text = value->count ? value->text[0] : "";
+    if (!read_kind(block, parameter, value, &place, &out_of_range)) {
+        const char *unit = parameter->unit && *parameter->unit ? parameter->unit : NULL;
+        if (parameter->kind == FL_KIND_CHOICE)
+            snprintf(reason, reason_size, "%s is none of %s", text, parameter->choices);
+        else
+            snprintf(reason, reason_size, "%s%s is not %s%s%s", value->list ? "the list beginning with " : "",
+                     *text ? text : "nothing", kind_names[parameter->kind], unit ? " in " : "", unit ? unit : "");
+        return false;
+    }
+    if (out_of_range) {
+        snprintf(reason, reason_size, "%s is outside %g to %g%s%s", text, parameter->min, parameter->max,
+                 parameter->unit ? " " : "", parameter->unit ? parameter->unit : "");
+        return false;
+    }
+    memcpy((char *)parameters + parameter->offset, &place, kind_size(parameter->kind));
+    return true;
+}
+
+static const struct fl_parameter *parameter_named(const struct fl_block_type *type, const char *name)
+{
+    for (uint32_t i = 0; i < type->parameter_count; i++)
+        if (strcmp(type->parameters[i].name, name) == 0)
+            return &type->parameters[i];
+    return NULL;
+}
+
+static void list_names(const struct fl_block_type *type, char *out, size_t size)
+{
+    size_t used = 0;
+    out[0] = '\0';
+    for (uint32_t i = 0; i < type->parameter_count && used < size; i++)
+        used += (size_t)snprintf(out + used, size - used, "%s%s", i ? ", " : "", type->parameters[i].name);
+    if (!type->parameter_count)
+        snprintf(out, size, "none");
+}
+
+void parameters_set(struct fl_block *block, const struct written *written, size_t count, unsigned line,
+                    struct problems *problems)
+{
+    char reason[256];
+    const struct fl_block_type *type = block->type;
+    void *parameters = (void *)(uintptr_t)block->parameters;
+    for (uint32_t i = 0; i < type->parameter_count; i++) {
+        const struct fl_parameter *parameter = &type->parameters[i];
+        const struct written *value = NULL;
+        for (size_t w = 0; w < count && !value; w++)
+            if (strcmp(written[w].name, parameter->name) == 0)
+                value = &written[w];
+        const struct written fallback = {parameter->name, line, false, 1, (const char **)&parameter->fallback};
+        if (!value && !parameter->fallback)
+            problem(problems, line, "block %s: parameter %s of %s is missing: %s", block->name, parameter->name,
+                    type->name, parameter->summary ? parameter->summary : kind_names[parameter->kind]);
+        else if (!parameter_set(block, parameter, parameters, value ? value : &fallback, reason, sizeof reason))
+            problem(problems, value ? value->line : line, "block %s: parameter %s: %s", block->name, parameter->name,
+                    reason);
+    }
+    for (size_t w = 0; w < count; w++) {
+        if (!parameter_named(type, written[w].name)) {
+            list_names(type, reason, sizeof reason);
+            problem(problems, written[w].line, "block %s: %s has no parameter %s; it has %s", block->name, type->name,
+                    written[w].name, reason);
+        }
+    }
+}

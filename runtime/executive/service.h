@@ -1,0 +1,25 @@
+/* The executive's side of a block: its memory, its last failure, the priority of its threads. */
+#ifndef FLOTILLA_SERVICE_H
+#define FLOTILLA_SERVICE_H
+
+#include <flotilla/block.h>
+#include <pthread.h>
+
+enum { FL_FAILURE_BYTES = 256 };
+
+struct fl_memory {
+    struct fl_memory *next;
+};
+
+struct fl_service {
+    struct fl_memory *memory;
+    char failure[FL_FAILURE_BYTES];
+    int priority; /* SCHED_FIFO of the block's threads; 0: ordinary */
+    struct fl_port *in_ports, *out_ports;
+};
+
+/* Start a thread named after the block, at the service's priority where that is allowed; 0 or an errno. */
+int fl_service_thread(struct fl_service *service, pthread_t *thread, const char *name, void *(*enter)(void *),
+                      void *argument);
+
+#endif

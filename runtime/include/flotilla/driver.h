@@ -1,0 +1,105 @@
+/* What a block that drives a device needs: a thread of its own for the I/O, and the serial port.
+ *
+ * The thread may block; the block's step never does. What arrives is stamped by the thread (CLOCK_MONOTONIC) and handed
+ * over through a ring, so that the step knows value, age and sequence.
+ */
+#ifndef FLOTILLA_DRIVER_H
+#define FLOTILLA_DRIVER_H
+
+#include <flotilla/block.h>
+#include <flotilla/ring.h>
+
+/* --- thread --- */
+
+struct fl_driver;
+
+/* Start `run(driver, context)` in a thread with locked memory, one priority below the task's: a device that floods
+ * must not delay the control step. NULL after fl_fail(). */
+struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
+                                  void *context);
+
+/* Ask the thread to return and wait for it. NULL is allowed. */
+void fl_driver_stop(struct fl_driver *driver);
+
+/* A descriptor that becomes readable when the thread shall return: poll it beside the device's. */
+int fl_driver_stop_fd(const struct fl_driver *driver);
+
+/* Wait until `fd` is readable (or writable with `writable`), at most `timeout_ms` (-1: for ever; fd -1: only wait).
+ * 1 ready, 0 time-out, -1 the thread shall return, -2 the device is gone (hang-up or error). */
+int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int timeout_ms);
+
+/* --- sensors --- */
+
+/* The last outputs of every sensor block, after its values. */
+#define FL_SENSOR_OUTPUTS                                                                                              \
+    {.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: the value is good and not older than `timeout`"},  \
+        {.name = "age", .type = FL_DOUBLE, .width = 1, .unit = "s", .summary = "time since the value arrived"},        \
+        {.name = "sequence", .type = FL_UINT32, .width = 1, .summary = "values received so far"}
+
+/* --- serial port --- */
+
+/* Members and parameters of a block with a serial port, as the port's mask lists them. */
+#define FL_SERIAL_MEMBERS                                                                                              \
+    struct fl_device device;                                                                                           \
+    int64_t baud;                                                                                                      \
+    int64_t data_bits;                                                                                                 \
+    int64_t stop_bits;                                                                                                 \
+    int parity
+
+#define FL_SERIAL_PARAMETERS(type, usual_baud)                                                                         \
+    FL_PARAMETER(type, device, .summary = "serial port: /dev/robot/NAME"),                                             \
+        FL_PARAMETER(type, baud, .fallback = usual_baud, .min = 300, .max = 4000000, .unit = "Bd", .summary = "rate"), \
+        FL_PARAMETER(type, data_bits, .fallback = "8", .min = 5, .max = 8, .summary = "bits of a character"),          \
+        FL_PARAMETER(type, stop_bits, .fallback = "1", .min = 1, .max = 2, .summary = "stop bits"),                    \
+        FL_PARAMETER(type, parity, .fallback = "none", .choices = "none|odd|even", .summary = "parity bit")
+
+struct fl_serial_settings {
+    const char *device;
+    int64_t baud, data_bits, stop_bits;
+    int parity; /* index in "none|odd|even" */
+};
+
+#define FL_SERIAL_SETTINGS(parameters)                                                                                 \
+    ((struct fl_serial_settings){(parameters)->device.path, (parameters)->baud, (parameters)->data_bits,               \
+                                 (parameters)->stop_bits, (parameters)->parity})
+
+/* Open a port: raw, exclusive, non-blocking. The descriptor, or -1 with errno. */
+int fl_serial_open(const struct fl_serial_settings *settings);
+
+/* A sensor on a serial port, told apart from its block so that it can be fed with any bytes in a test. */
+struct fl_serial_protocol {
+    size_t parser_size; /* bytes of the parser's state, zero at start and whenever the port is opened anew */
+    size_t sample_size; /* bytes of a complete measurement */
+
+    /* Take one byte. True when it completed a measurement, which is in `sample` then. */
+    bool (*feed)(void *parser, uint8_t byte, void *sample);
+
+    /* What to send now, at most `size` bytes into `out`; their number. NULL where nothing is ever sent. Called when the
+     * port was opened (silent_ms is -1), after each batch of bytes (0), and every 100 ms of silence with its length. */
+    size_t (*send)(void *parser, const void *parameters, int silent_ms, uint8_t *out, size_t size);
+};
+
+struct fl_serial;
+
+/* Start the thread that opens the port, reads, and opens it again whenever it was gone (unplugged). The device need not
+ * be there yet: fl_serial_connected() says. NULL after fl_fail(). `parameters` is handed to the protocol's `send`. */
+struct fl_serial *fl_serial_start(struct fl_block *block, const struct fl_serial_protocol *protocol,
+                                  struct fl_serial_settings settings, const void *parameters);
+
+/* The newest measurement since the last call into `sample`, when it arrived, and how many have arrived in all.
+ * False, with nothing changed, when there is none. For the step. */
+bool fl_serial_newest(struct fl_serial *serial, void *sample, int64_t *arrived_ns, uint32_t *sequence);
+
+/* Every measurement in turn, for a block that needs each. */
+bool fl_serial_next(struct fl_serial *serial, void *sample, int64_t *arrived_ns, uint32_t *sequence);
+
+/* Whether the port is open: false from the moment the device is found to be gone. */
+bool fl_serial_connected(const struct fl_serial *serial);
+
+/* Queue bytes to be sent by the thread, from the step: false when too many wait already. */
+bool fl_serial_send(struct fl_serial *serial, const uint8_t *bytes, size_t count);
+
+/* Stop the thread and close the port. NULL is allowed. */
+void fl_serial_stop(struct fl_serial *serial);
+
+#endif
