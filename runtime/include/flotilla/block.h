@@ -49,7 +49,9 @@ int fl_type_named(const char *name);         /* the type of that name, or -1 */
 
 enum {
     FL_OPTIONAL = 1u << 0, /* input: may stay without a wire, and then reads zero */
-    FL_DELAYED = 1u << 1,  /* input: is not used for outputs of the same step, so it may close a loop */
+    /* input: reads the source's value of the previous step, because the block runs before its source; so it may close
+     * a loop */
+    FL_DELAYED = 1u << 1,
 };
 
 struct fl_port {

@@ -1,0 +1,324 @@
+#define _GNU_SOURCE
+#include "executive.h"
+
+#include "block.h"
+#include "privilege.h"
+#include "watch.h"
+
+#include <errno.h>
+#include <inttypes.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdatomic.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <sys/signalfd.h>
+#include <systemd/sd-daemon.h>
+#include <time.h>
+#include <unistd.h>
+
+enum {
+    STACK_BYTES = 128 * 1024, /* touched before the first step */
+    WATCH_MS = 20,
+    CATCH_UP_PERIODS = 10, /* further behind, the rest is left out */
+};
+
+#define SECOND_NS INT64_C(1000000000)
+
+struct executive {
+    struct task *task;
+    const struct run_options *options;
+    struct run_result *result;
+    struct watch *watch; /* NULL: nothing is printed */
+    int ended_fd;
+    _Atomic bool stop, ended;
+    _Atomic uint64_t heartbeat; /* steps done, for the watching thread */
+};
+
+/* --- life of blocks --- */
+
+static void end(struct run_result *result, enum ending ending, const struct fl_block *block, const char *text)
+{
+    if (result->ending != ENDING_NONE)
+        return; /* the first cause counts */
+    result->ending = ending;
+    snprintf(result->reason, sizeof result->reason, "%s%s%s", block ? block->name : "", block ? ": " : "", text);
+}
+
+static bool start_blocks(struct task *task, struct run_result *result)
+{
+    for (size_t i = 0; i < task->count; i++) {
+        struct member *member = &task->members[i];
+        member->started = true; /* terminate also cleans up after a start that failed halfway */
+        if (member->block->type->start && member->block->type->start(member->block) != FL_OK) {
+            end(result, ENDING_FAILED, member->block, member->block->service->failure);
+            return false;
+        }
+    }
+    for (size_t i = 0; i < task->count; i++) {
+        struct fl_block *block = task->members[i].block;
+        if (block->type->initialize && block->type->initialize(block) != FL_OK) {
+            end(result, ENDING_FAILED, block, block->service->failure);
+            return false;
+        }
+    }
+    return true;
+}
+
+static void make_outputs_safe(struct task *task)
+{
+    for (size_t i = task->count; i-- > 0;)
+        if (task->members[i].started && task->members[i].block->type->safe)
+            task->members[i].block->type->safe(task->members[i].block);
+}
+
+static void terminate_blocks(struct task *task)
+{
+    for (size_t i = task->count; i-- > 0;) {
+        struct member *member = &task->members[i];
+        if (member->started && member->block->type->terminate)
+            member->block->type->terminate(member->block);
+        member->started = false;
+    }
+}
+
+unsigned executive_make_safe(struct task *task)
+{
+    unsigned failures = 0;
+    for (size_t i = 0; i < task->count; i++) {
+        struct member *member = &task->members[i];
+        const struct fl_block_type *type = member->block->type;
+        if (!type->safe)
+            continue;
+        member->started = true;
+        if (type->start && type->start(member->block) != FL_OK) {
+            fprintf(stderr, "%s: %s\n", member->block->name, member->block->service->failure);
+            failures++;
+        } else {
+            type->safe(member->block);
+        }
+    }
+    terminate_blocks(task);
+    return failures;
+}
+
+/* --- control thread --- */
+
+static void touch_stack(void)
+{
+    volatile unsigned char stack[STACK_BYTES];
+    for (size_t i = 0; i < sizeof stack; i += 1024)
+        stack[i] = 0;
+}
+
+static void sleep_until(int64_t release_ns)
+{
+    const struct timespec release = {release_ns / SECOND_NS, (long)(release_ns % SECOND_NS)};
+    while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &release, NULL) == EINTR)
+        continue;
+}
+
+/* One step of the task; false when a block failed. The end of a block's step is the begin of the next one's. */
+static bool step_blocks(struct executive *executive, int64_t release_ns, int64_t *now_ns)
+{
+    struct task *task = executive->task;
+    for (size_t i = 0; i < task->count; i++) {
+        struct member *member = &task->members[i];
+        struct fl_block *block = member->block;
+        if (member->until) {
+            member->until--;
+            continue;
+        }
+        member->until = (uint32_t)member->every - 1;
+        block->release_ns = release_ns;
+        int failed = block->type->step(block);
+        block->step++;
+        int64_t after_ns = fl_now_ns();
+        statistics_add(&member->time, after_ns - *now_ns);
+        *now_ns = after_ns;
+        if (failed) {
+            end(executive->result, ENDING_FAILED, block, block->service->failure);
+            return false;
+        }
+    }
+    return true;
+}
+
+/* When the step after one that was released at `release_ns` and ended at `now_ns` is due. */
+static int64_t next_release(struct executive *executive, int64_t release_ns, int64_t now_ns, int64_t *in_a_row)
+{
+    const struct task *task = executive->task;
+    struct run_result *result = executive->result;
+    int64_t next_ns = release_ns + task->period_ns;
+    if (executive->options->no_wait || now_ns <= next_ns) {
+        *in_a_row = 0;
+        return next_ns;
+    }
+    char text[128];
+    result->overruns++;
+    ++*in_a_row;
+    if (task->overrun == OVERRUN_STOP_SAFE || (task->overruns && *in_a_row >= task->overruns)) {
+        snprintf(text, sizeof text,
+                 "step %" PRIu64 " ended %" PRId64 " us after the next was due, %" PRId64 " in a row", result->steps,
+                 (now_ns - next_ns) / 1000, *in_a_row);
+        end(result, ENDING_OVERRUN, NULL, text);
+    }
+    int64_t behind = (now_ns - next_ns) / task->period_ns + 1;
+    if (task->overrun == OVERRUN_CATCH_UP && behind <= CATCH_UP_PERIODS)
+        return next_ns;
+    result->skipped += (uint64_t)behind;
+    return next_ns + behind * task->period_ns;
+}
+
+static void *control(void *argument)
+{
+    struct executive *executive = argument;
+    const struct run_options *options = executive->options;
+    struct run_result *result = executive->result;
+    int64_t in_a_row = 0, period_ns = executive->task->period_ns;
+    touch_stack();
+    /* On a multiple of the period, so that tasks of one computer keep their phases. */
+    int64_t release_ns = (fl_now_ns() / period_ns + 2) * period_ns;
+    while (!atomic_load_explicit(&executive->stop, memory_order_relaxed)) {
+        if (!options->no_wait)
+            sleep_until(release_ns);
+        int64_t begin_ns = fl_now_ns(), now_ns = begin_ns;
+        if (!options->no_wait)
+            statistics_add(&result->jitter, begin_ns - release_ns);
+        bool good = step_blocks(executive, release_ns, &now_ns);
+        statistics_add(&result->step, now_ns - begin_ns);
+        if (executive->watch && good)
+            watch_put(executive->watch, result->steps, release_ns, options->no_wait);
+        result->steps++;
+        atomic_store_explicit(&executive->heartbeat, result->steps, memory_order_release);
+        if (!good)
+            break;
+        if (result->steps == options->steps)
+            end(result, ENDING_ASKED, NULL, "all steps are done");
+        release_ns = next_release(executive, release_ns, now_ns, &in_a_row);
+        if (result->ending != ENDING_NONE)
+            break;
+    }
+    make_outputs_safe(executive->task);
+    atomic_store(&executive->ended, true);
+    eventfd_write(executive->ended_fd, 1);
+    return NULL;
+}
+
+/* --- watching thread --- */
+
+/* Until the control thread has ended, or cannot. */
+static void supervise(struct executive *executive, int signals_fd)
+{
+    uint64_t usec = 0, last = 0;
+    int64_t period_ns = executive->task->period_ns, moved_ns = fl_now_ns(), notified_ns = 0;
+    int64_t patience_ns = 10 * period_ns + SECOND_NS;
+    bool guarded = sd_watchdog_enabled(0, &usec) > 0;
+    int64_t interval_ns = guarded ? (int64_t)usec * 1000 / 4 : SECOND_NS;
+    int64_t wake_ms = executive->watch ? WATCH_MS : interval_ns / 1000000;
+    while (!atomic_load(&executive->ended)) {
+        struct pollfd waiting[] = {{.fd = signals_fd, .events = POLLIN}, {.fd = executive->ended_fd, .events = POLLIN}};
+        poll(waiting, 2, (int)wake_ms);
+        if (executive->watch)
+            watch_print(executive->watch);
+        if (waiting[0].revents) {
+            struct signalfd_siginfo received;
+            if (read(signals_fd, &received, sizeof received) == sizeof received)
+                atomic_store(&executive->stop, true);
+        }
+        int64_t now_ns = fl_now_ns();
+        uint64_t steps = atomic_load_explicit(&executive->heartbeat, memory_order_acquire);
+        if (steps != last || period_ns > now_ns - moved_ns) {
+            /* Only a task that steps may say that it is alive. */
+            if (guarded && now_ns - notified_ns >= interval_ns) {
+                sd_notify(0, "WATCHDOG=1");
+                notified_ns = now_ns;
+            }
+        }
+        if (steps != last)
+            moved_ns = now_ns;
+        last = steps;
+        if (now_ns - moved_ns > patience_ns)
+            return;
+    }
+}
+
+static int block_signals(void)
+{
+    sigset_t signals;
+    sigemptyset(&signals);
+    sigaddset(&signals, SIGTERM);
+    sigaddset(&signals, SIGINT);
+    sigaddset(&signals, SIGHUP);
+    pthread_sigmask(SIG_BLOCK, &signals, NULL);
+    return signalfd(-1, &signals, SFD_CLOEXEC);
+}
+
+/* Neither stop nor end by itself: outputs to their reset state from here, and leave the thread where it is. */
+static void abandon(struct executive *executive)
+{
+    char text[128];
+    snprintf(text, sizeof text, "no step for ten periods and a second, after step %" PRIu64,
+             atomic_load(&executive->heartbeat));
+    make_outputs_safe(executive->task);
+    fprintf(stderr, "flotilla: %s: %s; outputs are in their reset state\n", executive->task->name, text);
+    fflush(NULL);
+    _exit(1);
+}
+
+void executive_run(struct task *task, const struct run_options *options, struct run_result *result)
+{
+    pthread_t thread;
+    struct executive executive = {.task = task, .options = options, .result = result};
+    *result = (struct run_result){0};
+    int signals_fd = block_signals();
+    executive.ended_fd = eventfd(0, EFD_CLOEXEC);
+    if (options->watched_count)
+        executive.watch = watch_create(options->watched, options->watched_count);
+    for (size_t i = 0; i < task->count; i++)
+        task->members[i].until = (uint32_t)task->members[i].offset;
+    if (!options->no_wait)
+        privilege_lock_memory();
+    int priority = options->no_wait ? 0 : privilege_priority(task->priority);
+    for (size_t i = 0; i < task->count; i++)
+        task->members[i].block->service->priority = priority ? priority - 1 : 0;
+    if (start_blocks(task, result)) {
+        struct fl_service service = {.priority = priority};
+        int error = fl_service_thread(&service, &thread, task->name, control, &executive);
+        if (error) {
+            end(result, ENDING_FAILED, NULL, strerror(error));
+        } else {
+            sd_notify(0, "READY=1");
+            supervise(&executive, signals_fd);
+            if (!atomic_load(&executive.ended))
+                abandon(&executive);
+            sd_notify(0, "STOPPING=1");
+            pthread_join(thread, NULL);
+            if (executive.watch)
+                watch_print(executive.watch);
+        }
+    }
+    end(result, ENDING_ASKED, NULL, "a signal asked for it");
+    terminate_blocks(task);
+    watch_destroy(executive.watch);
+    close(executive.ended_fd);
+    close(signals_fd);
+}
+
+void executive_write_statistics(const struct task *task, const struct run_result *result, FILE *out)
+{
+    fprintf(out, "{\"task\": \"%s\", \"period_ns\": %" PRId64 ", \"steps\": %" PRIu64, task->name, task->period_ns,
+            result->steps);
+    fprintf(out, ", \"overruns\": %" PRIu64 ", \"skipped\": %" PRIu64 ",\n \"jitter\": ", result->overruns,
+            result->skipped);
+    statistics_write(&result->jitter, out);
+    fprintf(out, ",\n \"step\": ");
+    statistics_write(&result->step, out);
+    fprintf(out, ",\n \"blocks\": {");
+    for (size_t i = 0; i < task->count; i++) {
+        fprintf(out, "%s\n  \"%s\": ", i ? "," : "", task->members[i].block->name);
+        statistics_write(&task->members[i].time, out);
+    }
+    fprintf(out, "}}\n");
+}

@@ -1,0 +1,55 @@
+/* Runs a task: start and initialize all blocks, step them in real time, leave outputs in their reset state.
+ *
+ * The steps run in a thread of their own (SCHED_FIFO at the task's priority), released at absolute times. The caller's
+ * thread watches: signals, the service manager's watchdog, what is to be printed. It never waits for the control
+ * thread without a bound, so a task cannot hang.
+ */
+#ifndef FLOTILLA_EXECUTIVE_H
+#define FLOTILLA_EXECUTIVE_H
+
+#include "statistics.h"
+#include "task.h"
+
+#include <stdbool.h>
+#include <stdio.h>
+
+enum ending {
+    ENDING_NONE,
+    ENDING_ASKED,   /* a signal, or all steps done */
+    ENDING_FAILED,  /* a block's start, initialize or step */
+    ENDING_OVERRUN, /* overrun policy stop-safe, or too many in a row */
+    ENDING_HUNG,    /* the control thread made no step for ten periods and a second */
+};
+
+struct watched {
+    const char *name; /* "block.port" as it was asked for */
+    const void *signal;
+    enum fl_type type;
+    uint32_t width;
+};
+
+struct run_options {
+    uint64_t steps;                /* end after that many; 0: never */
+    bool no_wait;                  /* do not wait for a release: time is counted, not measured */
+    const struct watched *watched; /* print them each step as a line of JSON on stdout */
+    size_t watched_count;
+};
+
+struct run_result {
+    enum ending ending;
+    char reason[320];
+    uint64_t steps, overruns, skipped; /* skipped: releases that were left out */
+    struct statistics jitter;          /* from a step's release to its begin */
+    struct statistics step;            /* from begin to end */
+};
+
+/* Run until it ends; the blocks are terminated and the result is complete then. Messages go to stderr. */
+void executive_run(struct task *task, const struct run_options *options, struct run_result *result);
+
+/* Bring all outputs to their reset state without a step: for after a task that was killed. Number of failures. */
+unsigned executive_make_safe(struct task *task);
+
+/* Steps, overruns and times of task and blocks as JSON. */
+void executive_write_statistics(const struct task *task, const struct run_result *result, FILE *out);
+
+#endif

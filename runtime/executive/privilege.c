@@ -1,0 +1,34 @@
+#define _GNU_SOURCE
+#include "privilege.h"
+
+#include <errno.h>
+#include <sched.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/mman.h>
+
+void privilege_lock_memory(void)
+{
+    if (mlockall(MCL_CURRENT | MCL_FUTURE) < 0)
+        fprintf(
+            stderr,
+            "flotilla: memory cannot be locked (%s; CAP_IPC_LOCK or LimitMEMLOCK=): a page fault may delay a step\n",
+            strerror(errno));
+}
+
+int privilege_priority(int priority)
+{
+    struct sched_param before, wanted = {.sched_priority = priority};
+    if (!priority)
+        return 0;
+    int policy = sched_getscheduler(0);
+    if (sched_getparam(0, &before) < 0 || sched_setscheduler(0, SCHED_FIFO, &wanted) < 0) {
+        fprintf(
+            stderr,
+            "flotilla: SCHED_FIFO %d is refused (%s; CAP_SYS_NICE or LimitRTPRIO=): steps will be late under load\n",
+            priority, strerror(errno));
+        return 0;
+    }
+    sched_setscheduler(0, policy, &before);
+    return priority;
+}

@@ -1,0 +1,12 @@
+/* What real time needs of the system. What is refused is said on stderr with its consequence; the task runs all the
+ * same, as it must on a development computer. */
+#ifndef FLOTILLA_PRIVILEGE_H
+#define FLOTILLA_PRIVILEGE_H
+
+/* Keep all memory, present and future, in RAM. */
+void privilege_lock_memory(void);
+
+/* `priority` where SCHED_FIFO is allowed, otherwise 0. */
+int privilege_priority(int priority);
+
+#endif

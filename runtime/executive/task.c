@@ -1,0 +1,436 @@
+#define _GNU_SOURCE
+#include "task.h"
+
+#include "block.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+/* An input's place in the graph, while it is built. */
+struct edge {
+    size_t from, to; /* `from` runs first */
+};
+
+struct building {
+    struct task *task;
+    const struct task_file *file;
+    struct problems *problems;
+    struct edge *edges;
+    size_t edge_count;
+};
+
+static void *grown(void *memory, size_t bytes)
+{
+    memory = realloc(memory, bytes);
+    if (!memory)
+        abort();
+    return memory;
+}
+
+/* --- blocks --- */
+
+static void make_block(struct building *building, const struct registry *registry, const struct block_entry *entry)
+{
+    struct member *member = &building->task->members[building->task->count];
+    const struct fl_block_type *type = entry->type ? registry_find(registry, entry->type) : NULL;
+    if (!type) {
+        const char *nearest = entry->type ? registry_nearest(registry, entry->type) : NULL;
+        if (entry->type)
+            problem(building->problems, entry->line, "block %s: there is no block %s%s%s; flotilla-blocks lists them",
+                    entry->name, entry->type, nearest ? ", the nearest is " : "", nearest ? nearest : "");
+        return;
+    }
+    struct fl_block *block = block_create(type, entry->name);
+    unsigned before = building->problems->count;
+    *member = (struct member){.block = block, .every = entry->every, .offset = entry->offset};
+    building->task->count++;
+    block->period_ns = building->file->period_ns * entry->every;
+    block->service->priority = building->task->priority ? building->task->priority - 1 : 0;
+    parameters_set(block, entry->parameters, entry->parameter_count, entry->line, building->problems);
+    if (building->problems->count == before && type->configure && type->configure(block) != FL_OK)
+        problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
+    member->incomplete = type->configure && building->problems->count != before;
+    if (block_make_signals(block) != FL_OK)
+        problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
+}
+
+static const char *device_of(const struct fl_block *block, const struct fl_parameter *parameter)
+{
+    if (parameter->kind != FL_KIND_DEVICE)
+        return NULL;
+    return ((const struct fl_device *)((const char *)block->parameters + parameter->offset))->path;
+}
+
+/* Two blocks on one device would take each other's bytes. */
+static void check_devices(struct building *building)
+{
+    const struct task *task = building->task;
+    for (size_t i = 0; i < task->count; i++) {
+        for (size_t j = 0; j < i; j++) {
+            const struct fl_block *later = task->members[i].block, *earlier = task->members[j].block;
+            for (uint32_t p = 0; p < later->type->parameter_count; p++) {
+                for (uint32_t q = 0; q < earlier->type->parameter_count; q++) {
+                    const char *path = device_of(later, &later->type->parameters[p]);
+                    const char *other = device_of(earlier, &earlier->type->parameters[q]);
+                    if (path && other && strcmp(path, other) == 0)
+                        problem(building->problems, building->file->blocks[i].line,
+                                "block %s: %s is block %s's; a device serves one block", later->name, path,
+                                earlier->name);
+                }
+            }
+        }
+    }
+}
+
+/* --- wires --- */
+
+static struct fl_block *block_named(const struct task *task, const char *name, size_t length, size_t *index)
+{
+    for (size_t i = 0; i < task->count; i++) {
+        struct fl_block *block = task->members[i].block;
+        if (strlen(block->name) == length && memcmp(block->name, name, length) == 0) {
+            if (index)
+                *index = i;
+            return block;
+        }
+    }
+    return NULL;
+}
+
+static void list_ports(const struct fl_port *ports, uint32_t count, char *out, size_t size)
+{
+    size_t used = 0;
+    snprintf(out, size, "none");
+    for (uint32_t i = 0; i < count && used < size; i++)
+        used += (size_t)snprintf(out + used, size - used, "%s%s", i ? ", " : "", ports[i].name);
+}
+
+static int port_named(const struct fl_port *ports, uint32_t count, const char *name, size_t length)
+{
+    for (uint32_t i = 0; i < count; i++)
+        if (strlen(ports[i].name) == length && memcmp(ports[i].name, name, length) == 0)
+            return (int)i;
+    return -1;
+}
+
+/* What "block.port[index]" means; NULL with a reason. */
+static const void *find_signal(const struct task *task, const char *name, size_t *source, enum fl_type *type,
+                               uint32_t *width, char *reason, size_t reason_size)
+{
+    char known[160];
+    size_t block_length = strcspn(name, ".");
+    const char *port_name = name + block_length + (name[block_length] == '.');
+    size_t port_length = strcspn(port_name, "[");
+    const struct fl_block *block = block_named(task, name, block_length, source);
+    if (!name[block_length] || !port_length) {
+        snprintf(reason, reason_size, "%s is neither a wire (block.port) nor a number", name);
+        return NULL;
+    }
+    if (!block) {
+        snprintf(reason, reason_size, "%s: the task has no block %.*s", name, (int)block_length, name);
+        return NULL;
+    }
+    int port = port_named(block->out_ports, block->out_count, port_name, port_length);
+    if (port < 0) {
+        list_ports(block->out_ports, block->out_count, known, sizeof known);
+        snprintf(reason, reason_size, "%s: %s has no output %.*s; it has %s", name, block->type->name, (int)port_length,
+                 port_name, known);
+        return NULL;
+    }
+    *type = block->out_ports[port].type;
+    *width = block->out_ports[port].width;
+    if (!port_name[port_length])
+        return block->out[port];
+    char *end;
+    unsigned long element = strtoul(port_name + port_length + 1, &end, 10);
+    if (strcmp(end, "]") != 0 || end == port_name + port_length + 1 || element >= *width) {
+        snprintf(reason, reason_size, "%s: its elements are [0] to [%u]", name, (unsigned)(*width - 1));
+        return NULL;
+    }
+    *width = 1;
+    return (const char *)block->out[port] + element * fl_type_size(*type);
+}
+
+const void *task_signal(const struct task *task, const char *name, enum fl_type *type, uint32_t *width, char *reason,
+                        size_t reason_size)
+{
+    return find_signal(task, name, NULL, type, width, reason, reason_size);
+}
+
+#define PUT_INTEGER(c_type, low, high)                                                                                 \
+    if (!read_integer(text, &integer) || integer < (low) || integer > (int64_t)(high))                                 \
+        return false;                                                                                                  \
+    *(c_type *)place = (c_type)integer;                                                                                \
+    return true
+
+/* A constant into a signal of some type; false where the type has no such value. */
+static bool put_constant(const char *text, enum fl_type type, void *place)
+{
+    int64_t integer;
+    double real;
+    switch (type) {
+    case FL_BOOLEAN:
+        *(uint8_t *)place = strcmp(text, "true") == 0 || strcmp(text, "1") == 0;
+        return *(uint8_t *)place || strcmp(text, "false") == 0 || strcmp(text, "0") == 0;
+    case FL_INT8:
+        PUT_INTEGER(int8_t, INT8_MIN, INT8_MAX);
+    case FL_UINT8:
+        PUT_INTEGER(uint8_t, 0, UINT8_MAX);
+    case FL_INT16:
+        PUT_INTEGER(int16_t, INT16_MIN, INT16_MAX);
+    case FL_UINT16:
+        PUT_INTEGER(uint16_t, 0, UINT16_MAX);
+    case FL_INT32:
+        PUT_INTEGER(int32_t, INT32_MIN, INT32_MAX);
+    case FL_UINT32:
+        PUT_INTEGER(uint32_t, 0, UINT32_MAX);
+    case FL_INT64:
+        PUT_INTEGER(int64_t, INT64_MIN, INT64_MAX);
+    case FL_UINT64:
+        PUT_INTEGER(uint64_t, 0, INT64_MAX);
+    case FL_SINGLE:
+        if (!read_real(text, &real))
+            return false;
+        *(float *)place = (float)real;
+        return true;
+    case FL_DOUBLE:
+        return read_real(text, place);
+    case FL_TYPES:
+        break;
+    }
+    return false;
+}
+
+/* Whether a text is meant as a constant: numbers and truth values, which no block's name looks like. */
+static bool is_constant(const char *text)
+{
+    return strchr("0123456789+-.", *text) || strcmp(text, "true") == 0 || strcmp(text, "false") == 0;
+}
+
+static void wire_constants(struct building *building, struct fl_block *block, uint32_t port,
+                           const struct written *written)
+{
+    const struct fl_port *to = &block->in_ports[port];
+    size_t size = fl_type_size(to->type);
+    char *place = (char *)(uintptr_t)block->in[port];
+    if (written->count != to->width) {
+        problem(building->problems, written->line, "block %s: input %s has %u elements, not %zu", block->name, to->name,
+                (unsigned)to->width, written->count);
+        return;
+    }
+    for (size_t i = 0; i < written->count; i++)
+        if (!put_constant(written->text[i], to->type, place + i * size))
+            problem(building->problems, written->line, "block %s: input %s: %s is not a %s", block->name, to->name,
+                    written->text[i], fl_type_name(to->type));
+}
+
+static void wire_input(struct building *building, size_t index, uint32_t port, const struct written *written)
+{
+    char reason[256];
+    enum fl_type type;
+    uint32_t width;
+    size_t source = index;
+    struct fl_block *block = building->task->members[index].block;
+    const struct fl_port *to = &block->in_ports[port];
+    if (written->list || !written->count || is_constant(written->text[0])) {
+        wire_constants(building, block, port, written);
+        return;
+    }
+    const void *signal = find_signal(building->task, written->text[0], &source, &type, &width, reason, sizeof reason);
+    if (building->task->members[source].incomplete)
+        return; /* told already */
+    if (!signal) {
+        problem(building->problems, written->line, "block %s: input %s: %s", block->name, to->name, reason);
+        return;
+    }
+    if (type != to->type || width != to->width) {
+        problem(building->problems, written->line, "block %s: input %s takes %s[%u], %s is %s[%u]", block->name,
+                to->name, fl_type_name(to->type), (unsigned)to->width, written->text[0], fl_type_name(type),
+                (unsigned)width);
+        return;
+    }
+    block_wire(block, port, signal);
+    if (to->flags & FL_DELAYED && source == index)
+        return; /* its own value of the step before, whatever the order */
+    building->edges = grown(building->edges, sizeof *building->edges * (building->edge_count + 1));
+    building->edges[building->edge_count++] =
+        to->flags & FL_DELAYED ? (struct edge){index, source} : (struct edge){source, index};
+}
+
+static void wire_block(struct building *building, size_t index, const struct block_entry *entry)
+{
+    char known[160];
+    const struct fl_block *block = building->task->members[index].block;
+    if (building->task->members[index].incomplete)
+        return;
+    for (uint32_t port = 0; port < block->in_count; port++) {
+        const struct fl_port *to = &block->in_ports[port];
+        const struct written *written = NULL;
+        for (size_t i = 0; i < entry->input_count && !written; i++)
+            if (strcmp(entry->inputs[i].name, to->name) == 0)
+                written = &entry->inputs[i];
+        if (written)
+            wire_input(building, index, port, written);
+        else if (!(to->flags & FL_OPTIONAL))
+            problem(building->problems, entry->line, "block %s: input %s has no wire: %s", block->name, to->name,
+                    to->summary ? to->summary : "it needs one");
+    }
+    for (size_t i = 0; i < entry->input_count; i++) {
+        const struct written *written = &entry->inputs[i];
+        if (port_named(block->in_ports, block->in_count, written->name, strlen(written->name)) < 0) {
+            list_ports(block->in_ports, block->in_count, known, sizeof known);
+            problem(building->problems, written->line, "block %s: %s has no input %s; it has %s", block->name,
+                    block->type->name, written->name, known);
+        }
+    }
+}
+
+/* --- order --- */
+
+/* Name a loop among the blocks that are left: walk against the edges until a block comes again. */
+static void tell_cycle(struct building *building, const bool *done)
+{
+    char loop[512] = "";
+    const struct task *task = building->task;
+    bool *seen = grown(NULL, task->count);
+    memset(seen, 0, task->count);
+    size_t at = 0;
+    while (done[at])
+        at++;
+    for (bool closing = false;;) {
+        if (seen[at]) { /* from here on it is the loop itself */
+            if (closing)
+                break;
+            closing = true;
+            memset(seen, 0, task->count);
+        }
+        seen[at] = true;
+        if (closing) {
+            char longer[sizeof loop];
+            snprintf(longer, sizeof longer, "%.100s%s%.380s", task->members[at].block->name, *loop ? " → " : "", loop);
+            memcpy(loop, longer, sizeof loop);
+        }
+        for (size_t e = 0; e < building->edge_count; e++) {
+            if (building->edges[e].to == at && !done[building->edges[e].from]) {
+                at = building->edges[e].from;
+                break;
+            }
+        }
+    }
+    problem(building->problems, building->file->blocks[at].line,
+            "cycle without delay: %s → %s; put a block delay into one of its wires", task->members[at].block->name,
+            loop);
+    free(seen);
+}
+
+/* Sources first; where that leaves a choice, as in the file. */
+static void order(struct building *building)
+{
+    struct task *task = building->task;
+    struct member *ordered = grown(NULL, sizeof *ordered * (task->count + 1));
+    bool *done = grown(NULL, task->count + 1);
+    memset(done, 0, task->count + 1);
+    for (size_t placed = 0; placed < task->count; placed++) {
+        size_t next = 0;
+        for (; next < task->count; next++) {
+            bool ready = !done[next];
+            for (size_t e = 0; e < building->edge_count && ready; e++)
+                ready = building->edges[e].to != next || done[building->edges[e].from];
+            if (ready)
+                break;
+        }
+        if (next == task->count) {
+            tell_cycle(building, done);
+            free(ordered);
+            free(done);
+            return;
+        }
+        done[next] = true;
+        ordered[placed] = task->members[next];
+    }
+    free(done);
+    free(task->members);
+    task->members = ordered;
+}
+
+/* --- all of it --- */
+
+static char *name_of(const char *path)
+{
+    const char *base = strrchr(path, '/');
+    char *name = strdup(base ? base + 1 : path);
+    if (!name)
+        abort();
+    char *suffix = strrchr(name, '.');
+    if (suffix && suffix != name)
+        *suffix = '\0';
+    return name;
+}
+
+void task_build(struct task *task, const struct registry *registry, struct problems *problems)
+{
+    struct task_file file;
+    struct building building = {.task = task, .file = &file, .problems = problems};
+    *task = (struct task){.name = name_of(problems->file)};
+    task_file_read(&file, problems);
+    task->period_ns = file.period_ns;
+    task->overruns = file.overruns;
+    task->overrun = file.overrun;
+    task->priority = (int)file.priority;
+    task->members = grown(NULL, sizeof *task->members * (file.count + 1));
+    for (size_t i = 0; i < file.count; i++)
+        make_block(&building, registry, &file.blocks[i]);
+    if (task->count == file.count) { /* otherwise every wire of what is missing would be a further message */
+        for (size_t i = 0; i < file.count; i++)
+            wire_block(&building, i, &file.blocks[i]);
+        check_devices(&building);
+        if (!problems->count)
+            order(&building);
+    }
+    free(building.edges);
+    task_file_free(&file);
+}
+
+void task_free(struct task *task)
+{
+    for (size_t i = 0; i < task->count; i++)
+        block_destroy(task->members[i].block);
+    free(task->members);
+    free(task->name);
+    *task = (struct task){0};
+}
+
+static void write_edge(const struct task *task, const struct fl_block *to, uint32_t input, FILE *out)
+{
+    for (size_t i = 0; i < task->count; i++) {
+        const struct fl_block *from = task->members[i].block;
+        for (uint32_t port = 0; port < from->out_count; port++) {
+            const char *start = from->out[port], *at = to->in[input];
+            size_t size = fl_type_size(from->out_ports[port].type);
+            if (at < start || at >= start + size * from->out_ports[port].width)
+                continue;
+            char element[32] = "";
+            if (from->out_ports[port].width > 1 && to->in_ports[input].width == 1)
+                snprintf(element, sizeof element, "[%zu]", (size_t)(at - start) / size);
+            fprintf(out, "  \"%s\" -> \"%s\" [label=\"%s%s → %s\"%s];\n", from->name, to->name,
+                    from->out_ports[port].name, element, to->in_ports[input].name,
+                    to->in_ports[input].flags & FL_DELAYED ? ", style=dashed" : "");
+        }
+    }
+}
+
+void task_write_dot(const struct task *task, FILE *out)
+{
+    fprintf(out, "digraph \"%s\" {\n  rankdir=LR;\n  node [shape=box];\n", task->name);
+    for (size_t i = 0; i < task->count; i++) {
+        const struct member *member = &task->members[i];
+        fprintf(out, "  \"%s\" [label=\"%s\\n%s", member->block->name, member->block->name, member->block->type->name);
+        if (member->every > 1)
+            fprintf(out, "\\nevery %lld", (long long)member->every);
+        fprintf(out, "\"];\n");
+    }
+    for (size_t i = 0; i < task->count; i++)
+        for (uint32_t port = 0; port < task->members[i].block->in_count; port++)
+            write_edge(task, task->members[i].block, port, out);
+    fprintf(out, "}\n");
+}

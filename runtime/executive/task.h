@@ -1,0 +1,39 @@
+/* A task: blocks, wired and in the order in which a step runs them. */
+#ifndef FLOTILLA_TASK_H
+#define FLOTILLA_TASK_H
+
+#include "registry.h"
+#include "statistics.h"
+#include "task_file.h"
+
+struct member {
+    struct fl_block *block;
+    int64_t every, offset;
+    struct statistics time; /* of its steps */
+    uint32_t until;         /* steps of the task until its next */
+    bool started;
+    bool incomplete; /* its ports are not known, because its parameters are wrong */
+};
+
+struct task {
+    char *name; /* the file's, without directory and suffix */
+    int64_t period_ns, overruns;
+    int priority;
+    enum overrun overrun;
+    struct member *members; /* in the order of execution */
+    size_t count;
+};
+
+/* Build the task of `problems->file`. All that is wrong goes to `problems`; what is built is usable when there was
+ * nothing. Opens no device. */
+void task_build(struct task *task, const struct registry *registry, struct problems *problems);
+void task_free(struct task *task);
+
+/* "block.port" or "block.port[2]" of `task`: the signal, its type and its width; NULL with the reason in `reason`. */
+const void *task_signal(const struct task *task, const char *name, enum fl_type *type, uint32_t *width, char *reason,
+                        size_t reason_size);
+
+/* The task as a graph for Graphviz. */
+void task_write_dot(const struct task *task, FILE *out);
+
+#endif
