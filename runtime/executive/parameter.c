@@ -236,7 +236,10 @@ void parameters_set(struct fl_block *block, const struct written *written, size_
         for (size_t w = 0; w < count && !value; w++)
             if (strcmp(written[w].name, parameter->name) == 0)
                 value = &written[w];
-        const struct written fallback = {parameter->name, line, false, 1, (const char **)&parameter->fallback};
+        /* An empty fallback is an empty list, or an empty text. */
+        const size_t written_fallback = parameter->fallback && *parameter->fallback;
+        const struct written fallback = {parameter->name, line, false, written_fallback,
+                                         (const char **)&parameter->fallback};
         if (!value && !parameter->fallback)
             problem(problems, line, "block %s: parameter %s of %s is missing: %s", block->name, parameter->name,
                     type->name, parameter->summary ? parameter->summary : kind_names[parameter->kind]);
