@@ -114,7 +114,7 @@ static void touch_stack(void)
 
 static void sleep_until(int64_t release_ns)
 {
-    const struct timespec release = {release_ns / SECOND_NS, (long)(release_ns % SECOND_NS)};
+    const struct timespec release = {(time_t)(release_ns / SECOND_NS), (long)(release_ns % SECOND_NS)};
     while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &release, NULL) == EINTR)
         continue;
 }
