@@ -7,7 +7,22 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from images.builder import bmap, cache, card, host, identity, manifest, namespace, paths, pool, progress, rootfs, tools
+from images.builder import (
+    bmap,
+    cache,
+    card,
+    host,
+    identity,
+    manifest,
+    namespace,
+    paths,
+    pool,
+    progress,
+    rootfs,
+    runtime,
+    tools,
+)
+from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet, Robot
 from images.builder.lock import Lock, read_lock
 
@@ -44,11 +59,26 @@ def build(fleet: Fleet, robots: list[Robot], directory: Path = paths.IMAGES) -> 
     host.check()
     namespace.check()
     with cache.exclusive():
+        check_tasks(fleet, robots)
         boards: dict[str, BoardBuild] = {}
         for robot in robots:
             if robot.board not in boards:
                 boards[robot.board] = board_build(fleet.boards[robot.board])
         return [_robot_image(fleet, robot, boards[robot.board], directory) for robot in robots]
+
+
+def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
+    """Refuse what the robots themselves would refuse, all of it at once."""
+    problems = []
+    for robot in robots:
+        for path, (content, _) in identity.render(fleet, robot).items() if robot.tasks else ():
+            if path.parent == identity.TASKS:
+                try:
+                    runtime.check_task(path.stem, content)
+                except UserError as error:
+                    problems.append(f"{robot.name}: {error}")
+    if problems:
+        raise UserError("\n".join(problems))
 
 
 def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) -> Path:

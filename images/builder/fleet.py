@@ -79,6 +79,14 @@ DeviceName = Annotated[
         "a small letter, then small letters, digits or underscores, such as gyro_2: it becomes /dev/robot/NAME",
     ),
 ]
+TaskName = Annotated[
+    str,
+    _matching(
+        r"[a-z][a-z0-9-]{0,31}",
+        "is not a task's name",
+        "a small letter, then small letters, digits or hyphens, such as heading: the file is ansible/tasks/NAME.yml",
+    ),
+]
 Word = Annotated[str, _matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
 Module = Annotated[str, _matching(r"[A-Za-z0-9_]+", "is not a kernel module's name", "such as ata_piix, without .ko")]
 
@@ -255,6 +263,8 @@ class Robot(Host):
     board: str
     """Name of the board, a key of `Fleet.boards`."""
     devices: dict[DeviceName, Device] = {}
+    tasks: list[TaskName] = []
+    """Control tasks that start with the robot: `ansible/tasks/NAME.yml` each."""
 
 
 class Fleet(_Model):

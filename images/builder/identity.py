@@ -21,6 +21,8 @@ from images.builder.fleet import Fleet, Host, Robot
 if TYPE_CHECKING:
     import jinja2
 
+TASKS = PurePosixPath("/etc/flotilla/tasks")
+"""Where a robot's control tasks lie on it."""
 _PRIVATE = {"ssh_host_ed25519_key.j2": 0o600}
 """Modes of templates whose result is not for everyone."""
 
@@ -115,7 +117,18 @@ def render(fleet: Fleet, robot: Robot) -> dict[PurePosixPath, tuple[bytes, int]]
             raise UserError(f"{paths.shown(template)}: {error}") from error
         if content.strip():
             files[PurePosixPath("/") / name.with_suffix("")] = (content, _PRIVATE.get(template.name, 0o644))
-    return files
+    return files | {TASKS / f"{task}.yml": (_task(task, values), 0o644) for task in robot.tasks}
+
+
+def _task(name: str, values: dict[str, object]) -> bytes:
+    """A control task, which may use the robot's variables like any template."""
+    import jinja2
+
+    file = paths.TASKS / f"{name}.yml"
+    try:
+        return _environment().from_string(file.read_text(encoding="utf-8")).render(values).encode()
+    except (jinja2.TemplateError, OSError) as error:
+        raise UserError(f"{paths.shown(file)}: {error}") from error
 
 
 def nodes(fleet: Fleet, robot: Robot) -> list[Node]:

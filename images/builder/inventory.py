@@ -40,7 +40,7 @@ Scope = tuple[str, str]
 
 _HOMES = {"fleet_name": "all", "network": "all", "board": "board_*"}
 """Variables that hosts share, and the one group whose `group_vars/` sets them."""
-_VARIABLES = {"number", "address", "devices", *_HOMES}
+_VARIABLES = {"number", "address", "devices", "tasks", *_HOMES}
 """The variables read here. Any others are Ansible's and its roles'."""
 
 _SYNTAX = "(syntax)"
@@ -420,7 +420,7 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
         findings += [((kind, host), message, remedy) for wrong, message, remedy in faults if wrong]
         member = {"name": host} | {key: variables[key] for key in ("address",) if key in variables}
         if kind == "robots":
-            member |= {key: variables[key] for key in ("number", "devices") if key in variables}
+            member |= {key: variables[key] for key in ("number", "devices", "tasks") if key in variables}
             member["board"] = own[0].removeprefix("board_") if own else ""
         raw[kind][host] = member
         if len(own) == 1:  # of several boards Ansible has merged one
@@ -552,6 +552,17 @@ def _devices(raw: dict[str, Any]) -> Iterator[Finding]:
                 yield loc, f"is the console's port ({console})", _free(ports, used.values(), console)
 
 
+def _tasks(raw: dict[str, Any]) -> Iterator[Finding]:
+    there = sorted(path.stem for path in paths.TASKS.glob("*.yml"))
+    for name, robot in raw["robots"].items():
+        named = {("robots", name, "tasks", index): task for index, task in enumerate(robot.get("tasks", ()))}
+        for loc, task, _ in _again(named.items()):
+            yield loc, f"{task} is listed already", "each task once"
+        for loc, task in named.items():
+            if task not in there:
+                yield loc, f"there is no file {paths.shown(paths.TASKS)}/{task}.yml", f"one of {', '.join(there)}"
+
+
 def _free(ports: dict[str, Any] | None, used: Iterable[str], console: str | None) -> str:
     """The ports of a board that one more device could take."""
     names = [name for name, port in (ports or {}).items() if name not in used and port.get("tty") != console]
@@ -590,4 +601,4 @@ def _radio(raw: dict[str, Any]) -> Iterator[Finding]:
         yield ("network", "ibss"), "is missing, and the link is ibss", "give ssid, frequency_mhz and bssid"
 
 
-_CHECKS = (_numbers, _addresses, _devices, _boards, _radio)
+_CHECKS = (_numbers, _addresses, _devices, _tasks, _boards, _radio)

@@ -46,6 +46,8 @@ _RECIPES = {
     "x86_64": _Recipe("amd64", ("robot", "x86_64")),
     "tools": _Recipe("amd64", ("tools",), system=False),
     "toolchain": _Recipe("amd64", ("toolchain",), system=False),
+    "runtime-i386": _Recipe("i386", ("runtime",), system=False),
+    "runtime-amd64": _Recipe("amd64", ("runtime",), system=False),
     "verify": _Recipe("i386", ("verify",), system=False),
 }
 NAMES = tuple(_RECIPES)

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, JsonValue
 
-from images.builder import cache, card, compare, mirror, paths
+from images.builder import cache, card, compare, mirror, paths, runtime
 from images.builder.errors import UserError
 from images.builder.filesystem import Node
 from images.builder.fleet import Board, Fleet, Robot
@@ -164,9 +164,10 @@ def shared(board: Board, lock: Lock, root: Path, base: Path, tools: Tools) -> Pa
             parts=board_parts(root, base),
             packages=packages(status),
         )
-        own = {f"linux-image-{made.kernel}"} if board.kernel == "lean" else set()
+        lean = board.kernel == "lean"
+        own = {"flotilla-runtime", *([f"linux-image-{made.kernel}"] if lean else [])}
         installed = {(package.name, package.version) for package in made.packages if package.name not in own}
-        locked = {(package.name, package.version) for package in (lock.without("kernel") if own else lock).packages}
+        locked = {(package.name, package.version) for package in (lock.without("kernel") if lean else lock).packages}
         if installed != locked:  # a defect of the builder, not the user's
             raise RuntimeError(f"installed and locked packages differ: {sorted(installed ^ locked)}")
         (out / "shared.json").write_text(made.model_dump_json())
@@ -314,8 +315,8 @@ def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
     ]
     own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
     return cache.digest(
-        *(lock.digest for lock in locks), *own_kernel, paths.OVERLAY, images / "rootfs", images / "builder",
-        images / "grub.cfg.j2", paths.PROJECT / "requirements.lock", board.model_dump_json(), *identity,
+        *(lock.digest for lock in locks), *own_kernel, runtime.key(board.architecture), paths.OVERLAY,
+        images / "rootfs", images / "builder", images / "grub.cfg.j2", paths.PROJECT / "requirements.lock", board.model_dump_json(), *identity,
     )  # fmt: skip
 
 

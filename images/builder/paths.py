@@ -19,6 +19,8 @@ IMAGES = BUILD / "images"
 """Card images with what belongs to them."""
 
 INVENTORY = PROJECT / "ansible" / "inventory"
+TASKS = PROJECT / "ansible" / "tasks"
+"""Control tasks that the inventory gives to robots."""
 OVERLAY = PROJECT / "rootfs_overlay"
 PACKAGES = PROJECT / "images" / "packages"
 LOCKS = PROJECT / "images" / "locks"

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from images.builder import cache, initramfs, kernel, namespace, paths, pool, progress, tools
+from images.builder import cache, initramfs, kernel, namespace, paths, pool, progress, runtime, tools
 from images.builder.chroot import Chroot, mount
 from images.builder.fleet import Board
 from images.builder.lock import Lock
@@ -40,11 +40,13 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     own = kernel.build(board.name) if board.kernel == "lean" else None
     if own:
         lock = lock.without("kernel")
+    drivers = runtime.build(lock.architecture)
     sources = [Path(__file__).parent / name for name in _STAGE_FILES]
     key = cache.digest(
         lock.digest,
         tools_lock.digest,
         own.directory.name if own else "",
+        drivers.directory.name,
         board.model_dump_json(include={"disk_modules", "architecture"}),
         _DATA,
         *sources,
@@ -62,11 +64,13 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             if own:
                 shutil.copy(own.package, repository)
                 kernels = [own.package.name]
+            shutil.copy(drivers.package, repository)
             stage = {
                 "architecture": lock.architecture,
                 "epoch": lock.epoch,
                 "packages": [package.name for package in lock.having("required", "userland")],
                 "kernels": kernels,
+                "runtime": drivers.package.name,
                 "disk_modules": None if own else board.disk_modules,
                 "tools": str(toolset),
                 "repository": str(repository),
@@ -135,6 +139,10 @@ def main(description_file: str) -> None:
     stage.in_target("perl", "-MPOSIX=strftime", "-e", 'print strftime("clock of the target: %F\\n", gmtime)')
     with _timed("kernel"):
         version = _kernel(stage, description["kernels"])
+    with _timed("runtime"):
+        shutil.copy(stage.tools / "repository" / description["runtime"], stage.target / "tmp/runtime.deb")
+        stage.in_target("dpkg", "--install", "/tmp/runtime.deb")
+        (stage.target / "tmp/runtime.deb").unlink()
     with _timed("overlay"):
         _remove_excluded(stage.target)
         _lay_overlay(stage.target)

@@ -56,7 +56,7 @@ CASES = {
         ROBOTS, "10.42.0.254", "10.42.0.1", "station.address", "is robot1's address…10.42.0.5"
     ),
     "copied without a new name": Case(
-        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 48…another name"
+        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 51…another name"
     ),
     # One robot
     "number 0": Case(ROBOTS, "number: 4", "number: 0", "robot4.number", "out of range…1 to 250"),
@@ -103,6 +103,9 @@ CASES = {
     "device's key": Case(
         ROBOTS, PORT3, PORT3.replace("port:", "prot:"), "robot3.devices.gyro.prot", "not known…mean port?", also=1
     ),
+    "no such task": Case(ROBOTS, "[heartbeat]", "[hartbeat]", "robot3.tasks.0", "no file…one of heartbeat", "hartbeat"),
+    "task twice": Case(ROBOTS, "[heartbeat]", "[heartbeat, heartbeat]", "robot3.tasks.1", "already…once", "heartbeat"),
+    "task's name": Case(ROBOTS, "[heartbeat]", "[Heart.beat]", "robot3.tasks.0", "not a task's name", "Heart", also=1),
     "devices empty": Case(
         ROBOTS, "10.42.0.4", "10.42.0.4\n          devices:", "robot4.devices", "is not a mapping…or remove it"
     ),
