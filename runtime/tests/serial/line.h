@@ -1,4 +1,5 @@
-/* A serial line whose other end is the test: a pseudo terminal behind a link that stays when it is unplugged. */
+/* A serial line whose other end is the test: a pseudo terminal behind a link that stays when it is unplugged.
+ * Define _GNU_SOURCE before. */
 #ifndef FLOTILLA_TEST_LINE_H
 #define FLOTILLA_TEST_LINE_H
 
