@@ -4,18 +4,22 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <flotilla/driver.h>
+#include <inttypes.h>
+#include <limits.h>
 #include <stdatomic.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
 #include <unistd.h>
 
 enum {
-    RECORDS = 64,
     SENDABLE = 16,
     SEND_BYTES = 64,
     REOPEN_MS = 100,
     SILENCE_MS = 100,
+    STUCK_MS = 1000, /* a port that takes no byte for so long is opened anew */
     BATCH = 256,
+    RATE_TOLERANCE = 50, /* 1/50: UARTs agree on a character up to some 4 % between them, of which this is half */
 };
 
 struct arrival {
@@ -29,17 +33,32 @@ struct sending {
     uint8_t bytes[SEND_BYTES];
 };
 
+/* The newest measurement, handed over without waiting: one slot is the thread's, one the step's, and the third is
+ * swapped for either's own. A ring would drop the newest when a slow step has let it fill up. */
+enum { SLOTS = 3, FRESH = 4 };
+
 struct fl_serial {
+    struct fl_block *block;
     const struct fl_serial_protocol *protocol;
     struct fl_serial_settings settings;
     const void *parameters;
     struct fl_driver *driver;
     struct fl_ring arrivals, sendings;
-    struct arrival *written, *taken; /* one record each for the two sides */
+    struct arrival *slots[SLOTS], *taken;
+    unsigned writing, reading; /* slots of the thread and of the step */
+    _Atomic unsigned middle;   /* the third, and FRESH until the step has swapped it */
     void *parser;
     uint32_t sequence;
+    int open_error; /* last told */
     _Atomic bool connected;
 };
+
+/* The exclusive mode would outlive the descriptor where something else keeps the terminal alive. */
+static void close_port(int fd)
+{
+    ioctl(fd, TIOCNXCL);
+    close(fd);
+}
 
 int fl_serial_open(const struct fl_serial_settings *settings)
 {
@@ -53,16 +72,23 @@ int fl_serial_open(const struct fl_serial_settings *settings)
                   parities[settings->parity] | (settings->stop_bits == 2 ? CSTOPB : 0);
     raw.c_iflag = IGNBRK | (settings->parity ? INPCK : 0);
     raw.c_ispeed = raw.c_ospeed = (speed_t)settings->baud;
-    if (ioctl(fd, TIOCEXCL) < 0 || ioctl(fd, TCSETS2, &raw) < 0 || ioctl(fd, TCFLSH, TCIOFLUSH) < 0) {
-        int error = errno;
-        close(fd);
+    struct termios2 set;
+    int error = 0;
+    if (ioctl(fd, TIOCEXCL) < 0 || ioctl(fd, TCSETS2, &raw) < 0 || ioctl(fd, TCGETS2, &set) < 0 ||
+        ioctl(fd, TCFLSH, TCIOFLUSH) < 0)
+        error = errno;
+    /* A driver takes the nearest rate it has, or the one before, and says nothing. */
+    else if (llabs((long long)set.c_ospeed - settings->baud) > settings->baud / RATE_TOLERANCE)
+        error = ERANGE;
+    if (error) {
+        close_port(fd);
         errno = error;
         return -1;
     }
     return fd;
 }
 
-/* Send all of `bytes`; false when the thread shall return or the device is gone. */
+/* Send all of `bytes`; false when the thread shall return, or the device is gone or stuck. */
 static bool write_all(const struct fl_driver *driver, int fd, const uint8_t *bytes, size_t count)
 {
     while (count) {
@@ -72,7 +98,7 @@ static bool write_all(const struct fl_driver *driver, int fd, const uint8_t *byt
             count -= (size_t)written;
         } else if (written < 0 && errno != EAGAIN && errno != EINTR) {
             return false;
-        } else if (fl_driver_wait(driver, fd, true, -1) < 0) {
+        } else if (fl_driver_wait(driver, fd, true, STUCK_MS) <= 0) {
             return false;
         }
     }
@@ -97,42 +123,68 @@ static bool send_queued(struct fl_serial *serial, const struct fl_driver *driver
     return true;
 }
 
+static void forget_queued(struct fl_serial *serial)
+{
+    struct sending queued;
+    while (fl_ring_take(&serial->sendings, &queued))
+        ;
+}
+
 static void feed(struct fl_serial *serial, const uint8_t *bytes, size_t count)
 {
-    serial->written->at_ns = fl_now_ns();
+    int64_t now_ns = fl_now_ns();
     for (size_t at = 0; at < count; at++) {
-        if (serial->protocol->feed(serial->parser, bytes[at], serial->written->sample)) {
-            serial->written->sequence = ++serial->sequence;
-            fl_ring_put(&serial->arrivals, serial->written);
-        }
+        struct arrival *arrival = serial->slots[serial->writing];
+        if (!serial->protocol->feed(serial->parser, bytes[at], arrival->sample))
+            continue;
+        arrival->at_ns = now_ns;
+        arrival->sequence = ++serial->sequence;
+        if (serial->protocol->records)
+            fl_ring_put(&serial->arrivals, arrival);
+        else
+            serial->writing = atomic_exchange(&serial->middle, serial->writing | FRESH) & ~(unsigned)FRESH;
     }
 }
 
-/* Talk to an open port until it is gone or the thread shall return. */
-static void converse(struct fl_serial *serial, const struct fl_driver *driver, int fd)
+/* Talk to an open port until it is gone (true) or the thread shall return (false). */
+static bool converse(struct fl_serial *serial, const struct fl_driver *driver, int fd)
 {
-    int silent_ms = 0;
+    int64_t heard_ns = fl_now_ns();
     memset(serial->parser, 0, serial->protocol->parser_size);
-    if (!send_request(serial, driver, fd, -1))
-        return;
+    if (!send_request(serial, driver, fd, FL_SERIAL_OPENED))
+        return true;
     for (;;) {
         uint8_t bytes[BATCH];
         int ready = fl_driver_wait(driver, fd, false, SILENCE_MS);
         if (ready < 0)
-            return;
-        if (ready == 0) {
-            silent_ms += SILENCE_MS;
-        } else {
+            return ready == -2;
+        if (ready > 0) {
             ssize_t count = read(fd, bytes, sizeof bytes);
             if (count == 0 || (count < 0 && errno != EAGAIN && errno != EINTR))
-                return;
+                return true;
             if (count > 0)
                 feed(serial, bytes, (size_t)count);
-            silent_ms = 0;
+            heard_ns = fl_now_ns();
         }
-        if (!send_request(serial, driver, fd, silent_ms) || !send_queued(serial, driver, fd))
-            return;
+        int64_t silent_ms = ready > 0 ? 0 : (fl_now_ns() - heard_ns) / 1000000;
+        if (!send_request(serial, driver, fd, silent_ms < INT_MAX ? (int)silent_ms : INT_MAX) ||
+            !send_queued(serial, driver, fd))
+            return true;
     }
+}
+
+/* Say once why a port cannot be opened, not ten times a second. */
+static void tell_open(struct fl_serial *serial, int error)
+{
+    if (error == serial->open_error)
+        return;
+    serial->open_error = error;
+    if (error == ERANGE)
+        fl_log(serial->block, "%s cannot do %" PRId64 " Bd", serial->settings.device, serial->settings.baud);
+    else if (error)
+        fl_log(serial->block, "cannot open %s: %s; trying on", serial->settings.device, strerror(error));
+    else
+        fl_log(serial->block, "%s is open", serial->settings.device);
 }
 
 static void run(struct fl_driver *driver, void *context)
@@ -140,12 +192,21 @@ static void run(struct fl_driver *driver, void *context)
     struct fl_serial *serial = context;
     do {
         int fd = fl_serial_open(&serial->settings);
+        tell_open(serial, fd < 0 ? errno : 0);
         if (fd < 0)
             continue;
+        forget_queued(serial);
         atomic_store(&serial->connected, true);
-        converse(serial, driver, fd);
+        bool gone = converse(serial, driver, fd);
         atomic_store(&serial->connected, false);
-        close(fd);
+        if (gone) {
+            /* Else close() would wait for what can no longer be sent. */
+            ioctl(fd, TCFLSH, TCIOFLUSH);
+            fl_log(serial->block, "%s is gone", serial->settings.device);
+        } else if (send_queued(serial, driver, fd)) {
+            send_request(serial, driver, fd, FL_SERIAL_CLOSING);
+        }
+        close_port(fd);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);
 }
 
@@ -154,31 +215,43 @@ struct fl_serial *fl_serial_start(struct fl_block *block, const struct fl_serial
 {
     size_t record = (sizeof(struct arrival) + protocol->sample_size + 7) & ~(size_t)7;
     struct fl_serial *serial = fl_allocate(block, sizeof *serial);
-    void *arrivals = fl_allocate(block, fl_ring_bytes(record, RECORDS));
+    void *arrivals = fl_allocate(block, fl_ring_bytes(record, protocol->records));
     void *sendings = fl_allocate(block, fl_ring_bytes(sizeof(struct sending), SENDABLE));
     if (!serial || !arrivals || !sendings)
         return NULL;
+    serial->block = block;
     serial->protocol = protocol;
     serial->settings = settings;
     serial->parameters = parameters;
     serial->parser = fl_allocate(block, protocol->parser_size);
-    serial->written = fl_allocate(block, record);
     serial->taken = fl_allocate(block, record);
-    if (!serial->parser || !serial->written || !serial->taken)
+    for (unsigned slot = 0; slot < SLOTS; slot++)
+        if (!(serial->slots[slot] = fl_allocate(block, record)))
+            return NULL;
+    if (!serial->parser || !serial->taken)
         return NULL;
-    fl_ring_initialize(&serial->arrivals, arrivals, record, RECORDS);
+    serial->writing = 0;
+    serial->reading = 1;
+    atomic_init(&serial->middle, 2);
+    fl_ring_initialize(&serial->arrivals, arrivals, record, protocol->records);
     fl_ring_initialize(&serial->sendings, sendings, sizeof(struct sending), SENDABLE);
     serial->driver = fl_driver_start(block, run, serial);
     return serial->driver ? serial : NULL;
 }
 
+static void hand_over(const struct fl_serial *serial, const struct arrival *arrival, void *sample, int64_t *arrived_ns,
+                      uint32_t *sequence)
+{
+    memcpy(sample, arrival->sample, serial->protocol->sample_size);
+    *arrived_ns = arrival->at_ns;
+    *sequence = arrival->sequence;
+}
+
 bool fl_serial_next(struct fl_serial *serial, void *sample, int64_t *arrived_ns, uint32_t *sequence)
 {
-    if (!fl_ring_take(&serial->arrivals, serial->taken))
+    if (!serial->protocol->records || !fl_ring_take(&serial->arrivals, serial->taken))
         return false;
-    memcpy(sample, serial->taken->sample, serial->protocol->sample_size);
-    *arrived_ns = serial->taken->at_ns;
-    *sequence = serial->taken->sequence;
+    hand_over(serial, serial->taken, sample, arrived_ns, sequence);
     return true;
 }
 
@@ -186,9 +259,18 @@ bool fl_serial_newest(struct fl_serial *serial, void *sample, int64_t *arrived_n
 {
     bool any = false;
     /* Bounded: the thread may put while this takes, but a step must end. */
-    for (int taken = 0; taken < RECORDS && fl_serial_next(serial, sample, arrived_ns, sequence); taken++)
+    for (uint32_t taken = 0; taken < serial->protocol->records; taken++) {
+        if (!fl_serial_next(serial, sample, arrived_ns, sequence))
+            break;
         any = true;
-    return any;
+    }
+    if (serial->protocol->records)
+        return any;
+    if (!(atomic_load(&serial->middle) & FRESH))
+        return false;
+    serial->reading = atomic_exchange(&serial->middle, serial->reading) & ~(unsigned)FRESH;
+    hand_over(serial, serial->slots[serial->reading], sample, arrived_ns, sequence);
+    return true;
 }
 
 bool fl_serial_connected(const struct fl_serial *serial)
@@ -199,7 +281,7 @@ bool fl_serial_connected(const struct fl_serial *serial)
 bool fl_serial_send(struct fl_serial *serial, const uint8_t *bytes, size_t count)
 {
     struct sending queued = {.count = (uint32_t)count};
-    if (count > sizeof queued.bytes)
+    if (count > sizeof queued.bytes || !fl_serial_connected(serial))
         return false;
     memcpy(queued.bytes, bytes, count);
     return fl_ring_put(&serial->sendings, &queued);

@@ -63,19 +63,25 @@ struct fl_serial_settings {
     ((struct fl_serial_settings){(parameters)->device.path, (parameters)->baud, (parameters)->data_bits,               \
                                  (parameters)->stop_bits, (parameters)->parity})
 
-/* Open a port: raw, exclusive, non-blocking. The descriptor, or -1 with errno. */
+/* Open a port: raw, exclusive, non-blocking. The descriptor, or -1 with errno; ERANGE: it cannot do the rate. */
 int fl_serial_open(const struct fl_serial_settings *settings);
+
+/* `silent_ms` of a protocol's `send` at the two ends of a conversation. */
+enum { FL_SERIAL_OPENED = -1, FL_SERIAL_CLOSING = -2 };
 
 /* A sensor on a serial port, told apart from its block so that it can be fed with any bytes in a test. */
 struct fl_serial_protocol {
     size_t parser_size; /* bytes of the parser's state, zero at start and whenever the port is opened anew */
     size_t sample_size; /* bytes of a complete measurement */
+    uint32_t records;   /* measurements that can wait for fl_serial_next, a power of two; 0: only the newest is kept */
 
-    /* Take one byte. True when it completed a measurement, which is in `sample` then. */
+    /* Take one byte. True when it completed a measurement, which is in `sample` then; nothing is written there else,
+     * and the next byte may come with another place. */
     bool (*feed)(void *parser, uint8_t byte, void *sample);
 
-    /* What to send now, at most `size` bytes into `out`; their number. NULL where nothing is ever sent. Called when the
-     * port was opened (silent_ms is -1), after each batch of bytes (0), and every 100 ms of silence with its length. */
+    /* What to send now, at most `size` bytes into `out`; their number. NULL where nothing is ever sent. Called before
+     * the first byte is fed (silent_ms is FL_SERIAL_OPENED), after each batch of bytes (0), about every 100 ms of
+     * silence with its length so far, and before an orderly end (FL_SERIAL_CLOSING). */
     size_t (*send)(void *parser, const void *parameters, int silent_ms, uint8_t *out, size_t size);
 };
 
@@ -90,13 +96,16 @@ struct fl_serial *fl_serial_start(struct fl_block *block, const struct fl_serial
  * False, with nothing changed, when there is none. For the step. */
 bool fl_serial_newest(struct fl_serial *serial, void *sample, int64_t *arrived_ns, uint32_t *sequence);
 
-/* Every measurement in turn, for a block that needs each. */
+/* Every measurement in turn, for a block that needs each; its protocol says how many may wait. The number of those that
+ * did not fit is the gap in `sequence`. */
 bool fl_serial_next(struct fl_serial *serial, void *sample, int64_t *arrived_ns, uint32_t *sequence);
 
 /* Whether the port is open: false from the moment the device is found to be gone. */
 bool fl_serial_connected(const struct fl_serial *serial);
 
-/* Queue bytes to be sent by the thread, from the step: false when too many wait already. */
+/* Queue bytes to be sent by the thread, from the step: after the next bytes arrive, or within 100 ms. False when the
+ * port is not open or too many wait already. What waits when the port is lost is never sent: it would be a stale
+ * command to whatever is plugged in next. */
 bool fl_serial_send(struct fl_serial *serial, const uint8_t *bytes, size_t count);
 
 /* Stop the thread and close the port. NULL is allowed. */

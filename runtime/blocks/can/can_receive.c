@@ -1,0 +1,102 @@
+#include "socket.h"
+
+#include <flotilla/driver.h>
+#include <math.h>
+#include <string.h>
+
+struct can_receive {
+    const char *interface;
+    int64_t id, mask;
+    bool extended;
+    double timeout;
+};
+
+struct received {
+    struct can_socket can;
+    int64_t arrived_ns; /* of the last frame; before the first, when the block started */
+    uint32_t sequence;
+};
+
+static const struct fl_parameter parameters[] = {
+    FL_PARAMETER(struct can_receive, interface, .fallback = "can0", .summary = "network interface of the bus"),
+    FL_PARAMETER(struct can_receive, id, .min = 0, .max = CAN_EFF_MASK, .summary = "identifier to receive"),
+    FL_PARAMETER(struct can_receive, mask, .fallback = "0x1FFFFFFF", .min = 0, .max = CAN_EFF_MASK,
+                 .summary = "bits of the identifier that must be as in `id`"),
+    FL_PARAMETER(struct can_receive, extended, .fallback = "false", .summary = "identifiers of 29 bits instead of 11"),
+    FL_PARAMETER(struct can_receive, timeout, .fallback = "1", .min = 1e-6, .max = 1e6, .unit = "s",
+                 .summary = "age at which a frame is no longer good"),
+};
+
+enum { DATA, LENGTH, IDENTIFIER, FLAG, AGE, SEQUENCE };
+static const struct fl_port outputs[] = {
+    {.name = "data",
+     .type = FL_UINT8,
+     .width = CAN_MAX_DLEN,
+     .summary = "bytes of the newest frame, zero beyond `length`"},
+    {.name = "length", .type = FL_UINT8, .width = 1, .unit = "B", .summary = "how many bytes it had"},
+    {.name = "id", .type = FL_UINT32, .width = 1, .summary = "its identifier"},
+    FL_SENSOR_OUTPUTS,
+};
+
+static int configure(struct fl_block *block)
+{
+    const struct can_receive *set = block->parameters;
+    if (!set->extended && set->id > CAN_SFF_MASK)
+        return fl_fail(block, "id 0x%X has more than 11 bits: set `extended`", (unsigned)set->id);
+    return FL_OK;
+}
+
+static int start(struct fl_block *block)
+{
+    const struct can_receive *set = block->parameters;
+    struct received *received = block->state;
+    /* Data frames of the one format only: neither the other format's nor remote requests. */
+    const struct can_filter filter = {
+        .can_id = (canid_t)set->id | (set->extended ? CAN_EFF_FLAG : 0),
+        .can_mask = ((canid_t)set->mask & (set->extended ? CAN_EFF_MASK : CAN_SFF_MASK)) | CAN_EFF_FLAG | CAN_RTR_FLAG,
+    };
+    received->arrived_ns = fl_now_ns();
+    return can_open(block, &received->can, set->interface, &filter, 1);
+}
+
+static int step(struct fl_block *block)
+{
+    enum { FRAMES = 256 }; /* of one step: more would be a bus at 1 Mbit/s with a step each 30 ms */
+    const struct can_receive *set = block->parameters;
+    struct received *received = block->state;
+    struct can_frame frame;
+    for (int i = 0; i < FRAMES && can_receive(&received->can, &frame, &received->arrived_ns); i++) {
+        memset(block->out[DATA], 0, CAN_MAX_DLEN);
+        memcpy(block->out[DATA], frame.data, frame.len);
+        FL_OUT(block, LENGTH, uint8_t) = frame.len;
+        FL_OUT(block, IDENTIFIER, uint32_t) = frame.can_id & CAN_EFF_MASK;
+        received->sequence++;
+    }
+    int64_t age_ns = block->release_ns > received->arrived_ns ? block->release_ns - received->arrived_ns : 0;
+    FL_OUT(block, FLAG, uint8_t) =
+        received->sequence && !received->can.bus_off && age_ns <= llround(set->timeout * 1e9);
+    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
+    FL_OUT(block, SEQUENCE, uint32_t) = received->sequence;
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct received *received = block->state;
+    can_close(&received->can);
+}
+
+FL_BLOCK(can_receive) = {
+    .abi = FL_ABI,
+    .name = "can-receive",
+    .summary = "the newest frame of an identifier on a CAN bus",
+    .source = "ISO 11898-1; Linux, Documentation/networking/can.rst",
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct can_receive),
+    .state_size = sizeof(struct received),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .terminate = terminate,
+};

@@ -1,0 +1,112 @@
+/* A Maxon EPOS2 drive as a CANopen master sees it: frames in, frames out, the time given. No I/O, so that it can be
+ * tested and fuzzed with any frames.
+ *
+ * It brings the drive from any state into operation and keeps it there: reset of its communication, configuration by
+ * SDO with every answer checked, NMT start, then the state machine of CiA 402, one acknowledged transition after the
+ * other. Values are sampled by SYNC, once per call of epos2_advance. Both sides send heartbeats: a drive that is
+ * silent is taken for gone and begun anew, and a drive that misses ours stops its motor by itself. Ours are sent by
+ * epos2_advance only: whatever stops the control task stops the motor.
+ *
+ * Sources: CiA 301 4.2, CiA 402-2; Maxon, EPOS2 Firmware Specification, and the drive's EDS for what is shipped. */
+#ifndef FLOTILLA_EPOS2_H
+#define FLOTILLA_EPOS2_H
+
+#include <linux/can.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+/* In the order of the parameter `mode`. */
+enum epos2_mode { EPOS2_POSITION, EPOS2_VELOCITY, EPOS2_CURRENT, EPOS2_PROFILE_POSITION, EPOS2_PROFILE_VELOCITY };
+
+struct epos2_settings {
+    uint8_t node, master;    /* addresses on the bus */
+    enum epos2_mode mode;    /*                      */
+    uint16_t heartbeat_ms;   /* longest silence that either side tolerates */
+    double counts_per_rad;   /* of the encoder, at the gear's output */
+    double rpm_per_rad_s;    /* of the motor, for the gear's output */
+    uint32_t max_rpm;        /* profile velocity; 0 here and below: what the drive has stored */
+    uint32_t rpm_per_s;      /* profile acceleration and deceleration */
+    uint32_t stop_rpm_per_s; /* deceleration of a quick stop */
+    uint16_t limit_ma;       /* output current */
+    bool automatic_reset;    /* of faults, once a second; otherwise only by switching `enable` on again */
+};
+
+struct epos2_command {
+    bool enable;
+    double target; /* rad, rad/s or A, by mode; one that is not finite is no command: the motor is stopped */
+};
+
+struct epos2_values {
+    double position, velocity, current; /* rad, rad/s, A */
+};
+
+enum epos2_phase {
+    EPOS2_BOOTING,     /* a reset of its communication was sent; waiting for its boot-up message */
+    EPOS2_CONFIGURING, /* by SDO, one at a time */
+    EPOS2_RUNNING,
+    EPOS2_REFUSED, /* it aborted a configuration; begun anew after a second */
+};
+
+enum {
+    EPOS2_WRITES = 40, /* SDOs of a configuration, at most */
+    EPOS2_FRAMES = 4,  /* frames of one call, at most */
+};
+
+struct epos2_write {
+    uint16_t index;
+    uint8_t sub, size;
+    uint32_t value;
+};
+
+struct epos2 {
+    struct epos2_settings settings;
+    struct epos2_write writes[EPOS2_WRITES];
+    size_t write_count, write_next;
+    enum epos2_phase phase;
+    bool sdo_waiting;
+    int64_t phase_ns, sdo_ns;       /* begin of the phase, of the SDO that waits */
+    int64_t heard_ns, heartbeat_ns; /* its last heartbeat, ours */
+    int64_t stop_ns, reset_ns;      /* begin of a quick stop, the last fault reset */
+    bool stopping, reset_wanted, was_enabled;
+    bool have_position;
+    int64_t position_ns;
+    int32_t counts;
+    enum { SETPOINT_NONE, SETPOINT_OFFERED, SETPOINT_TAKEN } setpoint_state; /* of profile position */
+    int32_t setpoint;
+
+    /* What is known of the drive. */
+    uint16_t status_word;
+    bool status_known;
+    int8_t mode_display;
+    uint16_t error_code; /* of its last EMCY message; 0: none since the fault was reset */
+    uint32_t abort_code; /* of the SDO that was refused last; 0: none */
+    struct epos2_write abort_write;
+    struct epos2_values values;
+    int64_t values_ns; /* when the older of them arrived */
+    uint32_t sequence; /* complete sets of values */
+};
+
+/* The addresses from which the drive speaks, to be let through by the kernel's filter; their number. */
+enum { EPOS2_IDENTIFIERS = 7 };
+void epos2_identifiers(const struct epos2_settings *settings, uint32_t identifiers[EPOS2_IDENTIFIERS]);
+
+void epos2_begin(struct epos2 *drive, const struct epos2_settings *settings);
+
+/* Take a frame that arrived at `at_ns`. Any may come; those that are not the drive's, or malformed, change nothing. */
+void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t at_ns);
+
+/* The frames to send now, in their order; their number. To be called once per period. */
+size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_command *command,
+                     struct can_frame out[EPOS2_FRAMES]);
+
+/* The frames that take the power off the motor, whatever the drive is doing. */
+size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
+
+/* The frames after the last: powerless, and no longer waiting for our heartbeats. */
+size_t epos2_farewell(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
+
+/* The drive follows the target: it is enabled and says that it is in the mode asked for. */
+bool epos2_enabled(const struct epos2 *drive);
+
+#endif

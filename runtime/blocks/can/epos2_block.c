@@ -1,0 +1,209 @@
+/* The block `epos2`: the drive of epos2.h on a CAN interface. It has no thread: a step takes what the kernel has
+ * stamped and queued, and hands over what is to be sent, and neither can block. */
+#include "epos2.h"
+#include "socket.h"
+
+#include <flotilla/driver.h>
+#include <math.h>
+
+struct epos2_block {
+    const char *interface;
+    int64_t node, master;
+    int mode;
+    double counts, gear, heartbeat, max_velocity, acceleration, stop_deceleration, max_current, timeout;
+    int fault_reset;
+};
+
+struct state {
+    struct can_socket can;
+    struct epos2 drive;
+    bool open;
+    int64_t started_ns;
+};
+
+#define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
+
+static const struct fl_parameter parameters[] = {
+    FL_PARAMETER(struct epos2_block, interface, .fallback = "can0", .summary = "network interface of the bus"),
+    FL_PARAMETER(struct epos2_block, node, .min = 1, .max = 127, .summary = "the drive's node address"),
+    FL_PARAMETER(struct epos2_block, master, .fallback = "127", .min = 1, .max = 127,
+                 .summary = "node address under which this block sends heartbeats: another for each drive"),
+    FL_PARAMETER(struct epos2_block, mode, .choices = "position|velocity|current|profile-position|profile-velocity",
+                 .summary = "what the target is"),
+    FL_PARAMETER(struct epos2_block, counts, .fallback = "2000", .min = 1, .max = 1e9,
+                 .summary = "quadrature counts of a turn of the motor: four times the encoder's pulses"),
+    FL_PARAMETER(struct epos2_block, gear, .fallback = "1", .min = 1e-6, .max = 1e6,
+                 .summary = "turns of the motor for one of the gear's output, where target and outputs are measured"),
+    FL_PARAMETER(struct epos2_block, heartbeat, .fallback = "0.1", .min = 0.006, .max = 60, .unit = "s",
+                 .summary = "longest silence that drive and block tolerate of each other"),
+    FL_PARAMETER(struct epos2_block, max_velocity, .fallback = "0", .min = 0, .max = 1e6, .unit = "rad/s",
+                 .summary = "limit of velocity targets and profiles; 0 leaves what the drive has stored"),
+    FL_PARAMETER(struct epos2_block, acceleration, .fallback = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
+                 .summary = "of profiles, both ways; 0 leaves what the drive has stored"),
+    FL_PARAMETER(struct epos2_block, stop_deceleration, .fallback = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
+                 .summary = "of a quick stop; 0 leaves what the drive has stored"),
+    FL_PARAMETER(struct epos2_block, max_current, .fallback = "0", .min = 0, .max = 32.767, .unit = "A",
+                 .summary = "limit of the output current; 0 leaves what the drive has stored"),
+    FL_PARAMETER(struct epos2_block, timeout, .fallback = "0.1", .min = 1e-6, .max = 1e6, .unit = "s",
+                 .summary = "age from which a command, or a measurement, is too old"),
+    FL_PARAMETER(struct epos2_block, fault_reset, .fallback = "enable", .choices = "enable|automatic",
+                 .summary = "what resets a fault: `enable` going from 0 to 1, or also the block, once a second"),
+};
+
+enum { TARGET, ENABLE, COMMAND_AGE };
+static const struct fl_port inputs[] = {
+    {.name = "target", .type = FL_DOUBLE, .width = 1, .summary = "rad, rad/s or A, by `mode`"},
+    {.name = "enable", .type = FL_BOOLEAN, .width = 1, .summary = "0: quick stop, then no power on the motor"},
+    {.name = "age",
+     .type = FL_DOUBLE,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .unit = "s",
+     .summary = "age of the command, which is as good as none beyond `timeout`; without a wire it is always new"},
+};
+
+enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, FLAG, AGE, SEQUENCE };
+static const struct fl_port outputs[] = {
+    {.name = "position", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "of the gear's output"},
+    {.name = "velocity", .type = FL_DOUBLE, .width = 1, .unit = "rad/s", .summary = "of the gear's output"},
+    {.name = "current", .type = FL_DOUBLE, .width = 1, .unit = "A", .summary = "of the motor"},
+    {.name = "status", .type = FL_UINT16, .width = 1, .summary = "status word, object 6041"},
+    {.name = "error", .type = FL_UINT16, .width = 1, .summary = "error code of a fault; 0: none"},
+    {.name = "abort",
+     .type = FL_UINT32,
+     .width = 1,
+     .summary = "SDO abort code with which the drive refused its configuration; 0: it did not"},
+    {.name = "enabled", .type = FL_BOOLEAN, .width = 1, .summary = "1: the motor follows the target"},
+    FL_SENSOR_OUTPUTS,
+};
+
+static uint32_t whole(double value, double limit)
+{
+    return (uint32_t)llround(value < limit ? value : limit);
+}
+
+static struct epos2_settings settings_of(const struct epos2_block *set)
+{
+    double rpm = RPM * set->gear;
+    return (struct epos2_settings){
+        .node = (uint8_t)set->node,
+        .master = (uint8_t)set->master,
+        .mode = (enum epos2_mode)set->mode,
+        .heartbeat_ms = (uint16_t)lround(set->heartbeat * 1e3),
+        .counts_per_rad = set->counts * set->gear * RPM / 60,
+        .rpm_per_rad_s = rpm,
+        .max_rpm = whole(set->max_velocity * rpm, INT32_MAX),
+        .rpm_per_s = whole(set->acceleration * rpm, UINT32_MAX),
+        .stop_rpm_per_s = whole(set->stop_deceleration * rpm, UINT32_MAX),
+        .limit_ma = (uint16_t)lround(set->max_current * 1e3),
+        .automatic_reset = set->fault_reset == 1,
+    };
+}
+
+static int configure(struct fl_block *block)
+{
+    const struct epos2_block *set = block->parameters;
+    if (set->node == set->master)
+        return fl_fail(block, "node and master are both %d: each node on a bus has its own address", (int)set->node);
+    if ((double)block->period_ns * 3e-9 > set->heartbeat)
+        return fl_fail(block, "heartbeat %g s is shorter than three periods: a drive that misses one step would stop",
+                       set->heartbeat);
+    return FL_OK;
+}
+
+static int start(struct fl_block *block)
+{
+    const struct epos2_block *set = block->parameters;
+    struct state *state = block->state;
+    struct epos2_settings settings = settings_of(set);
+    uint32_t identifiers[EPOS2_IDENTIFIERS];
+    struct can_filter filters[EPOS2_IDENTIFIERS];
+    epos2_begin(&state->drive, &settings);
+    epos2_identifiers(&settings, identifiers);
+    for (size_t i = 0; i < EPOS2_IDENTIFIERS; i++)
+        filters[i] = (struct can_filter){identifiers[i], CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
+    if (can_open(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS) != FL_OK)
+        return FL_FAILED;
+    state->open = true;
+    state->started_ns = fl_now_ns();
+    return FL_OK;
+}
+
+static void send_all(struct state *state, const struct can_frame *frames, size_t count)
+{
+    /* A frame that the queue refuses is not kept: the next step knows better what to send. */
+    for (size_t i = 0; i < count; i++)
+        can_send(&state->can, &frames[i]);
+}
+
+static void show(struct fl_block *block, const struct state *state)
+{
+    const struct epos2_block *set = block->parameters;
+    const struct epos2 *drive = &state->drive;
+    int64_t from_ns = drive->sequence ? drive->values_ns : state->started_ns;
+    int64_t age_ns = block->release_ns > from_ns ? block->release_ns - from_ns : 0;
+    bool good = drive->sequence && drive->phase == EPOS2_RUNNING && !state->can.bus_off &&
+                age_ns <= llround(set->timeout * 1e9);
+    FL_OUT(block, POSITION, double) = drive->values.position;
+    FL_OUT(block, VELOCITY, double) = drive->values.velocity;
+    FL_OUT(block, CURRENT, double) = drive->values.current;
+    FL_OUT(block, STATUS, uint16_t) = drive->status_word;
+    FL_OUT(block, ERROR, uint16_t) = drive->error_code;
+    FL_OUT(block, ABORT, uint32_t) = drive->abort_code;
+    FL_OUT(block, ENABLED, uint8_t) = good && epos2_enabled(drive);
+    FL_OUT(block, FLAG, uint8_t) = good;
+    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
+    FL_OUT(block, SEQUENCE, uint32_t) = drive->sequence;
+}
+
+static int step(struct fl_block *block)
+{
+    enum { FRAMES = 64 }; /* of one step, so that it ends: a dozen are usual */
+    const struct epos2_block *set = block->parameters;
+    struct state *state = block->state;
+    struct can_frame frame, out[EPOS2_FRAMES];
+    int64_t arrived_ns;
+    for (int i = 0; i < FRAMES && can_receive(&state->can, &frame, &arrived_ns); i++)
+        epos2_receive(&state->drive, &frame, arrived_ns);
+    bool fresh = FL_IN(block, COMMAND_AGE, double) <= set->timeout;
+    struct epos2_command command = {.enable = FL_IN(block, ENABLE, uint8_t),
+                                    .target = fresh ? FL_IN(block, TARGET, double) : (double)NAN};
+    send_all(state, out, epos2_advance(&state->drive, block->release_ns, &command, out));
+    show(block, state);
+    return FL_OK;
+}
+
+static void safe(struct fl_block *block)
+{
+    struct state *state = block->state;
+    struct can_frame out[EPOS2_FRAMES];
+    if (state->open)
+        send_all(state, out, epos2_disable(&state->drive, out));
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    struct can_frame out[EPOS2_FRAMES];
+    if (state->open)
+        send_all(state, out, epos2_farewell(&state->drive, out));
+    state->open = false;
+    can_close(&state->can);
+}
+
+FL_BLOCK(epos2) = {
+    .abi = FL_ABI,
+    .name = "epos2",
+    .summary = "Maxon EPOS2 motor drive on a CAN bus",
+    .source = "Maxon, EPOS2 Firmware Specification; CiA 301 4.2; CiA 402-2",
+    FL_TABLE(input, inputs),
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct epos2_block),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .safe = safe,
+    .terminate = terminate,
+};

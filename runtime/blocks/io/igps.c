@@ -1,0 +1,121 @@
+#include "igps.h"
+
+#include "sensor.h"
+#include "udp.h"
+
+#include <flotilla/driver.h>
+#include <math.h>
+#include <string.h>
+
+struct igps {
+    UDP_RECEIVER_MEMBERS;
+    int byte_order;
+    double range;
+    double timeout;
+};
+
+static const struct fl_parameter parameters[] = {
+    UDP_RECEIVER_PARAMETERS(struct igps),
+    FL_PARAMETER(struct igps, byte_order, .fallback = "little-endian", .choices = "little-endian|big-endian",
+                 .summary = "order of the bytes of a number; the iGPS computer is a PC, so least significant first"),
+    FL_PARAMETER(struct igps, range, .fallback = "100", .min = 0, .max = 1e6, .unit = "m",
+                 .summary = "greatest coordinate that is believed, either sign"),
+    FL_PARAMETER(struct igps, timeout, .flags = FL_TUNABLE, .fallback = "0.1", .min = 0.001, .max = 3600, .unit = "s",
+                 .summary = "a value that is older is not good"),
+};
+
+static const struct fl_port outputs[] = {
+    {.name = "position", .type = FL_DOUBLE, .width = 2, .unit = "m", .summary = "x and y, the last good ones"},
+    FL_SENSOR_OUTPUTS,
+    UDP_RECEIVER_OUTPUTS,
+};
+
+enum { POSITION, FLAG, AGE, SEQUENCE, DROPPED, REFUSED };
+
+struct state {
+    struct udp_receiver receiver;
+    struct sensor sensor;
+};
+
+static double read_double(const uint8_t *bytes, enum igps_byte_order order)
+{
+    uint64_t bits = 0;
+    double value;
+    for (int i = 0; i < 8; i++)
+        bits = bits << 8 | bytes[order == IGPS_BIG_ENDIAN ? i : 7 - i];
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+bool igps_read(const uint8_t *bytes, size_t count, enum igps_byte_order order, double range,
+               struct igps_position *position)
+{
+    if (count != IGPS_BYTES)
+        return false;
+    const struct igps_position read = {.y = read_double(bytes, order), .x = read_double(bytes + 8, order)};
+    /* Comparisons with NaN are false. */
+    if (!(fabs(read.x) <= range && fabs(read.y) <= range))
+        return false;
+    *position = read;
+    return true;
+}
+
+static int configure(struct fl_block *block)
+{
+    const struct igps *igps = block->parameters;
+    return udp_receiver_check(block, igps->local_address, igps->from);
+}
+
+static int start(struct fl_block *block)
+{
+    const struct igps *igps = block->parameters;
+    struct state *state = block->state;
+    sensor_start(&state->sensor);
+    return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from);
+}
+
+static int step(struct fl_block *block)
+{
+    const struct igps *igps = block->parameters;
+    struct state *state = block->state;
+    uint8_t bytes[IGPS_BYTES];
+    int64_t arrived_ns;
+    int budget = UDP_BURST;
+    while (udp_receive(&state->receiver, bytes, sizeof bytes, &arrived_ns, &budget)) {
+        struct igps_position position;
+        /* A right datagram with a number that cannot be is the system saying that it does not see the robot; one of
+         * another length is not of the system, and says nothing. */
+        if (!igps_read(bytes, sizeof bytes, (enum igps_byte_order)igps->byte_order, igps->range, &position)) {
+            state->sensor.good = false;
+            continue;
+        }
+        ((double *)block->out[POSITION])[0] = position.x;
+        ((double *)block->out[POSITION])[1] = position.y;
+        sensor_arrived(&state->sensor, arrived_ns);
+    }
+    sensor_outputs(&state->sensor, block, FLAG, igps->timeout);
+    FL_OUT(block, DROPPED, uint32_t) = state->receiver.dropped;
+    FL_OUT(block, REFUSED, uint32_t) = state->receiver.refused;
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    udp_receiver_close(&state->receiver);
+}
+
+FL_BLOCK(igps) = {
+    .abi = FL_ABI,
+    .name = "igps",
+    .summary = "planar position from an indoor positioning system (Metris/Nikon iGPS) by UDP",
+    .source = "no public format: 16 bytes, Y then X as IEEE 754 doubles in m, packed on the iGPS computer",
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct igps),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .terminate = terminate,
+};

@@ -1,0 +1,150 @@
+#define _GNU_SOURCE
+#include "queue.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <inttypes.h>
+#include <limits.h>
+#include <string.h>
+#include <sys/stat.h>
+
+/* Who uses a queue is kept in locks on its bytes, which the kernel drops with the process, however it ends: one for
+ * each end, and one that opening and closing hold meanwhile, so that they happen one after the other. A mqd_t of Linux
+ * is a file descriptor, and locks of open file descriptions (fcntl(2)) work on it. */
+enum { LOCK_ENDS = 0, LOCK_CHANGE = 2 };
+
+static bool lock(mqd_t descriptor, off_t from, off_t count, short kind, bool wait)
+{
+    struct flock range = {.l_type = kind, .l_whence = SEEK_SET, .l_start = from, .l_len = count};
+    return fcntl(descriptor, wait ? F_OFD_SETLKW : F_OFD_SETLK, &range) == 0;
+}
+
+/* Whether nobody but the holder of this descriptor uses the queue; nobody else can begin to then. */
+static bool is_ours_alone(mqd_t descriptor)
+{
+    return lock(descriptor, LOCK_ENDS, 2, F_WRLCK, false);
+}
+
+/* Whether the queue still has its name: the last user may have removed it before this one had its lock. */
+static bool is_removed(mqd_t descriptor)
+{
+    struct stat status;
+    return fstat(descriptor, &status) < 0 || status.st_nlink == 0;
+}
+
+int queue_check_name(struct fl_block *block, const char *name)
+{
+    size_t length = strlen(name);
+    if (name[0] != '/' || length < 2 || length > NAME_MAX || strchr(name + 1, '/'))
+        return fl_fail(block, "parameter name: %s is not a slash and a name without one, such as /heading", name);
+    return FL_OK;
+}
+
+static int fail_to_open(struct fl_block *block, const struct queue *queue, int64_t depth)
+{
+    switch (errno) {
+    case EINVAL:
+        return fl_fail(
+            block, "queue %s: %" PRId64 " messages of %zu bytes exceed the limits fs.mqueue.msg_max and msgsize_max",
+            queue->name, depth, queue->message_bytes);
+    case EMFILE:
+        return fl_fail(block, "queue %s: queues of this user exceed the limit RLIMIT_MSGQUEUE (LimitMSGQUEUE=)",
+                       queue->name);
+    case EACCES:
+        return fl_fail(block, "queue %s belongs to another user: see ls -l /dev/mqueue", queue->name);
+    case ENOSYS:
+        return fl_fail(block, "queue %s: the kernel has no message queues (CONFIG_POSIX_MQUEUE)", queue->name);
+    default:
+        return fl_fail(block, "queue %s: %s", queue->name, strerror(errno));
+    }
+}
+
+enum opened { OPENED, FAILED, AGAIN };
+
+/* With the change lock held: judge what was opened, and take the lock of this end. */
+static enum opened settle(struct queue *queue, struct fl_block *block, enum queue_end end, int64_t depth)
+{
+    struct mq_attr found;
+    if (mq_getattr(queue->descriptor, &found) < 0) {
+        fl_fail(block, "queue %s: %s", queue->name, strerror(errno));
+        return FAILED;
+    }
+    if (found.mq_msgsize != (long)queue->message_bytes || found.mq_maxmsg != depth) {
+        if (is_ours_alone(queue->descriptor) && mq_unlink(queue->name) == 0)
+            return AGAIN;
+        fl_fail(block,
+                "queue %s holds %ld messages of %ld bytes, and a running task uses it; here they are %" PRId64
+                " of %zu: type, width and depth must agree at both ends",
+                queue->name, found.mq_maxmsg, found.mq_msgsize, depth, queue->message_bytes);
+        return FAILED;
+    }
+    if (!lock(queue->descriptor, LOCK_ENDS + (off_t)end, 1, F_WRLCK, false)) {
+        fl_fail(block, "another block already %s queue %s", end == QUEUE_SENDER ? "sends to" : "receives from",
+                queue->name);
+        return FAILED;
+    }
+    return OPENED;
+}
+
+static enum opened open_once(struct queue *queue, struct fl_block *block, enum queue_end end, int64_t depth)
+{
+    struct mq_attr wanted = {.mq_maxmsg = (long)depth, .mq_msgsize = (long)queue->message_bytes};
+    queue->descriptor = mq_open(queue->name, O_RDWR | O_CREAT | O_NONBLOCK | O_CLOEXEC, 0660, &wanted);
+    if (queue->descriptor < 0) {
+        fail_to_open(block, queue, depth);
+        return FAILED;
+    }
+    enum opened opened = FAILED;
+    if (!lock(queue->descriptor, LOCK_CHANGE, 1, F_WRLCK, true))
+        fl_fail(block, "queue %s cannot be locked: %s", queue->name, strerror(errno));
+    else if (is_removed(queue->descriptor))
+        opened = AGAIN;
+    else
+        opened = settle(queue, block, end, depth);
+    if (opened == OPENED)
+        lock(queue->descriptor, LOCK_CHANGE, 1, F_UNLCK, false);
+    else
+        mq_close(queue->descriptor);
+    return opened;
+}
+
+int queue_open(struct queue *queue, struct fl_block *block, enum queue_end end, const char *name, enum fl_type type,
+               int64_t width, int64_t depth)
+{
+    enum opened opened;
+    *queue = (struct queue){.name = name, .data_bytes = fl_type_size(type) * (size_t)width};
+    queue->message_bytes = sizeof(struct queue_message) + queue->data_bytes;
+    queue->message = fl_allocate(block, queue->message_bytes);
+    if (!queue->message)
+        return FL_FAILED;
+    do /* again only where somebody has just removed the queue */
+        opened = open_once(queue, block, end, depth);
+    while (opened == AGAIN);
+    queue->open = opened == OPENED;
+    return queue->open ? FL_OK : FL_FAILED;
+}
+
+bool queue_put(struct queue *queue)
+{
+    return mq_send(queue->descriptor, (const char *)queue->message, queue->message_bytes, 0) == 0;
+}
+
+bool queue_take(struct queue *queue)
+{
+    ssize_t got = mq_receive(queue->descriptor, (char *)queue->message, queue->message_bytes, NULL);
+    if (got >= 0 && (size_t)got != queue->message_bytes)
+        queue->message->type = FL_TYPES;
+    return got >= 0;
+}
+
+void queue_close(struct queue *queue)
+{
+    if (!queue->open)
+        return;
+    /* The kernel releases the locks with the descriptor. Who is just opening holds the change lock, and keeps it. */
+    if (lock(queue->descriptor, LOCK_CHANGE, 1, F_WRLCK, false) && is_ours_alone(queue->descriptor) &&
+        !is_removed(queue->descriptor))
+        mq_unlink(queue->name);
+    mq_close(queue->descriptor);
+    queue->open = false;
+}

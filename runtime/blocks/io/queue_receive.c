@@ -1,0 +1,106 @@
+#include "queue.h"
+#include "sensor.h"
+
+#include <flotilla/driver.h>
+#include <string.h>
+
+struct queue_receive {
+    QUEUE_MEMBERS;
+    int take;
+    double timeout;
+};
+
+enum take { NEWEST, IN_ORDER };
+
+static const struct fl_parameter parameters[] = {
+    QUEUE_PARAMETERS(struct queue_receive),
+    FL_PARAMETER(struct queue_receive, take, .fallback = "newest", .choices = "newest|in-order",
+                 .summary = "each step takes the newest message, or the next one that waits"),
+    FL_PARAMETER(struct queue_receive, timeout, .flags = FL_TUNABLE, .fallback = "0.1", .min = 0.001, .max = 3600,
+                 .unit = "s", .summary = "a value that is older is not good"),
+};
+
+static const struct fl_port outputs[] = {
+    FL_SENSOR_OUTPUTS,
+    {.name = "dropped", .type = FL_UINT32, .width = 1, .summary = "messages missing in the sender's count"},
+    {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "messages of another type or width"},
+};
+
+enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, DATA };
+
+struct state {
+    struct queue queue;
+    struct sensor sensor;
+    uint32_t last; /* the sender's count; 0: none */
+};
+
+static int configure(struct fl_block *block)
+{
+    const struct queue_receive *receive = block->parameters;
+    if (queue_check_name(block, receive->name) != FL_OK)
+        return FL_FAILED;
+    return fl_add_output(block, (struct fl_port){.name = "data",
+                                                 .type = (enum fl_type)receive->type,
+                                                 .width = (uint32_t)receive->width,
+                                                 .summary = "signal of the last message taken"});
+}
+
+static int start(struct fl_block *block)
+{
+    const struct queue_receive *receive = block->parameters;
+    struct state *state = block->state;
+    sensor_start(&state->sensor);
+    if (queue_open(&state->queue, block, QUEUE_RECEIVER, receive->name, (enum fl_type)receive->type, receive->width,
+                   receive->depth) != FL_OK)
+        return FL_FAILED;
+    for (int64_t i = 0; i < receive->depth && queue_take(&state->queue); i++)
+        ; /* what waited may be of a task that ended long ago */
+    return FL_OK;
+}
+
+static void accept(struct fl_block *block, struct state *state)
+{
+    const struct queue_message *message = state->queue.message;
+    if (message->type != block->out_ports[DATA].type || message->width != block->out_ports[DATA].width) {
+        FL_OUT(block, REFUSED, uint32_t)++;
+        return;
+    }
+    /* A count that is not ahead is of a sender that has started again. */
+    if (state->last && message->sequence > state->last)
+        FL_OUT(block, DROPPED, uint32_t) += message->sequence - state->last - 1;
+    state->last = message->sequence;
+    memcpy(block->out[DATA], message->data, state->queue.data_bytes);
+    sensor_arrived(&state->sensor, message->sent_ns);
+}
+
+static int step(struct fl_block *block)
+{
+    const struct queue_receive *receive = block->parameters;
+    struct state *state = block->state;
+    int64_t most = receive->take == IN_ORDER ? 1 : receive->depth;
+    for (int64_t i = 0; i < most && queue_take(&state->queue); i++)
+        accept(block, state);
+    sensor_outputs(&state->sensor, block, FLAG, receive->timeout);
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    queue_close(&state->queue);
+}
+
+FL_BLOCK(queue_receive) = {
+    .abi = FL_ABI,
+    .name = "queue-receive",
+    .summary = "receives a signal from a queue-send in another task of this computer",
+    .source = "POSIX.1-2017, mq_receive; Linux: mq_overview(7)",
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct queue_receive),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .terminate = terminate,
+};

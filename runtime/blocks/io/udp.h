@@ -1,0 +1,77 @@
+/* UDP sockets over IPv4 for blocks: opened at start, and never waited for. */
+#ifndef FLOTILLA_IO_UDP_H
+#define FLOTILLA_IO_UDP_H
+
+#include <flotilla/block.h>
+#include <netinet/in.h>
+
+enum {
+    /* What fits one Ethernet or 802.11 frame: a datagram in fragments is lost with any of them. */
+    UDP_LONGEST = 1500 - 20 - 8,
+    /* Datagrams that one step takes at most: a flood must not delay it. */
+    UDP_BURST = 64,
+};
+
+/* Where a socket of this computer is: members and parameters of a block. */
+#define UDP_LOCAL_MEMBERS                                                                                              \
+    const char *local_address;                                                                                         \
+    const char *interface
+
+#define UDP_LOCAL_PARAMETERS(type)                                                                                     \
+    FL_PARAMETER(type, local_address, .fallback = "0.0.0.0",                                                           \
+                 .summary = "IPv4 address of this computer; 0.0.0.0: any"),                                            \
+        FL_PARAMETER(type, interface, .fallback = "",                                                                  \
+                     .summary = "network interface that datagrams have to pass, such as wlan0; empty: any")
+
+/* What a block that receives has besides. */
+#define UDP_RECEIVER_MEMBERS                                                                                           \
+    int64_t port;                                                                                                      \
+    UDP_LOCAL_MEMBERS;                                                                                                 \
+    const char *from
+
+#define UDP_RECEIVER_PARAMETERS(type)                                                                                  \
+    FL_PARAMETER(type, port, .min = 1, .max = 65535, .summary = "UDP port of this computer"),                          \
+        UDP_LOCAL_PARAMETERS(type),                                                                                    \
+        FL_PARAMETER(type, from, .fallback = "0.0.0.0",                                                                \
+                     .summary = "IPv4 address that is listened to alone; 0.0.0.0: all are")
+
+/* Read a parameter's IPv4 address, of one computer or of a broadcast, for `configure`. FL_OK or FL_FAILED. */
+int udp_read_address(struct fl_block *block, const char *parameter, const char *text, struct in_addr *address);
+
+/* A socket bound to this computer's address, a port (0: any free one) and an interface: descriptor, or -1 after
+ * fl_fail(). */
+int udp_open(struct fl_block *block, const char *local_address, int64_t port, const char *interface);
+
+/* --- receiving --- */
+
+struct udp_receiver {
+    bool open;
+    int fd;
+    struct in_addr from;
+    int64_t emptied_ns; /* when last nothing waited: what comes later has arrived later */
+    uint32_t dropped;   /* by the kernel, for want of room */
+    uint32_t refused;   /* of another length, or not from `from` */
+};
+
+#define UDP_RECEIVER_OUTPUTS                                                                                           \
+    {.name = "dropped", .type = FL_UINT32, .width = 1, .summary = "datagrams that the kernel had no room for"},        \
+        {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "datagrams of another length or sender"}
+
+/* Whether the addresses among the parameters can be read, for `configure`. */
+int udp_receiver_check(struct fl_block *block, const char *local_address, const char *from);
+
+int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
+                      const char *interface, const char *from);
+
+/* When a datagram arrived, on CLOCK_MONOTONIC. The kernel stamps by the wall clock, which may be set at any time: what
+ * comes out of that wrong is kept between what is known for sure, after the queue was last empty and before now. */
+int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns);
+
+/* Take the next datagram, which must be of `length` bytes and is refused otherwise. Each call takes one off `budget`,
+ * UDP_BURST at the begin of a step, and there is none for a budget of 0. `arrived_ns` is when the kernel got it
+ * (SO_TIMESTAMPNS, see socket(7)), on CLOCK_MONOTONIC. */
+bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int64_t *arrived_ns, int *budget);
+
+void udp_receiver_close(struct udp_receiver *receiver);
+
+#endif

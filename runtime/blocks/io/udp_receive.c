@@ -1,0 +1,98 @@
+#include "sensor.h"
+#include "udp.h"
+
+#include <flotilla/driver.h>
+#include <string.h>
+
+struct udp_receive {
+    UDP_RECEIVER_MEMBERS;
+    int64_t length;
+    int take;
+    double timeout;
+};
+
+enum take { NEWEST, IN_ORDER };
+
+static const struct fl_parameter parameters[] = {
+    UDP_RECEIVER_PARAMETERS(struct udp_receive),
+    FL_PARAMETER(struct udp_receive, length, .min = 1, .max = UDP_LONGEST, .unit = "B",
+                 .summary = "payload of a datagram; one of another length is refused"),
+    FL_PARAMETER(struct udp_receive, take, .fallback = "newest", .choices = "newest|in-order",
+                 .summary = "each step takes the newest datagram, or the next one that waits"),
+    FL_PARAMETER(struct udp_receive, timeout, .flags = FL_TUNABLE, .fallback = "0.1", .min = 0.001, .max = 3600,
+                 .unit = "s", .summary = "a value that is older is not good"),
+};
+
+static const struct fl_port outputs[] = {
+    FL_SENSOR_OUTPUTS,
+    UDP_RECEIVER_OUTPUTS,
+};
+
+enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, DATA };
+
+struct state {
+    struct udp_receiver receiver;
+    struct sensor sensor;
+    uint8_t *scratch;
+};
+
+static int configure(struct fl_block *block)
+{
+    const struct udp_receive *udp = block->parameters;
+    if (udp_receiver_check(block, udp->local_address, udp->from) != FL_OK)
+        return FL_FAILED;
+    return fl_add_output(block, (struct fl_port){.name = "data",
+                                                 .type = FL_UINT8,
+                                                 .width = (uint32_t)udp->length,
+                                                 .summary = "payload of the last datagram taken"});
+}
+
+static int start(struct fl_block *block)
+{
+    const struct udp_receive *udp = block->parameters;
+    struct state *state = block->state;
+    sensor_start(&state->sensor);
+    state->scratch = fl_allocate(block, (size_t)udp->length);
+    if (!state->scratch)
+        return FL_FAILED;
+    return udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from);
+}
+
+static int step(struct fl_block *block)
+{
+    const struct udp_receive *udp = block->parameters;
+    struct state *state = block->state;
+    int64_t arrived_ns;
+    int budget = UDP_BURST;
+    while (udp_receive(&state->receiver, state->scratch, (size_t)udp->length, &arrived_ns, &budget)) {
+        memcpy(block->out[DATA], state->scratch, (size_t)udp->length);
+        sensor_arrived(&state->sensor, arrived_ns);
+        if (udp->take == IN_ORDER)
+            break;
+    }
+    sensor_outputs(&state->sensor, block, FLAG, udp->timeout);
+    FL_OUT(block, DROPPED, uint32_t) = state->receiver.dropped;
+    FL_OUT(block, REFUSED, uint32_t) = state->receiver.refused;
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    udp_receiver_close(&state->receiver);
+}
+
+FL_BLOCK(udp_receive) = {
+    .abi = FL_ABI,
+    .name = "udp-receive",
+    .summary = "receives datagrams of a fixed length, from other robots or the station; at most 64 in a step",
+    .source = "RFC 768; Linux: udp(7), socket(7)",
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct udp_receive),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .terminate = terminate,
+};

@@ -1,0 +1,133 @@
+#include "udp.h"
+
+#include <arpa/inet.h>
+#include <errno.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+struct udp_send {
+    const char *address;
+    int64_t port;
+    UDP_LOCAL_MEMBERS;
+    int64_t length;
+    bool broadcast;
+    int64_t dscp;
+};
+
+static const struct fl_parameter parameters[] = {
+    FL_PARAMETER(struct udp_send, address, .summary = "IPv4 address to send to"),
+    FL_PARAMETER(struct udp_send, port, .min = 1, .max = 65535, .summary = "UDP port to send to"),
+    UDP_LOCAL_PARAMETERS(struct udp_send),
+    FL_PARAMETER(struct udp_send, length, .min = 1, .max = UDP_LONGEST, .unit = "B",
+                 .summary = "payload of a datagram; it shall fit one frame"),
+    FL_PARAMETER(struct udp_send, broadcast, .fallback = "false",
+                 .summary = "whether `address` may be the broadcast address of a network"),
+    FL_PARAMETER(struct udp_send, dscp, .fallback = "0", .min = 0, .max = 63,
+                 .summary = "class of service (RFC 2474); 46 is voice to 802.11, which goes first"),
+};
+
+static const struct fl_port outputs[] = {
+    {.name = "sent", .type = FL_UINT32, .width = 1, .summary = "datagrams handed to the network so far"},
+    {.name = "failed",
+     .type = FL_UINT32,
+     .width = 1,
+     .summary = "datagrams the network did not take: no route, or full"},
+};
+
+enum { DATA };
+enum { SENT, FAILED };
+
+struct state {
+    bool open;
+    int fd;
+    struct sockaddr_in to;
+};
+
+static int configure(struct fl_block *block)
+{
+    const struct udp_send *udp = block->parameters;
+    struct in_addr to, local;
+    if (udp_read_address(block, "address", udp->address, &to) != FL_OK ||
+        udp_read_address(block, "local_address", udp->local_address, &local) != FL_OK)
+        return FL_FAILED;
+    if (to.s_addr == INADDR_ANY)
+        return fl_fail(block, "parameter address: 0.0.0.0 is nowhere to send to");
+    if (to.s_addr == INADDR_BROADCAST && !udp->broadcast)
+        return fl_fail(block, "parameter address: %s is a broadcast address; allow it by broadcast: true",
+                       udp->address);
+    return fl_add_input(block, (struct fl_port){.name = "data",
+                                                .type = FL_UINT8,
+                                                .width = (uint32_t)udp->length,
+                                                .summary = "payload, sent each step"});
+}
+
+/* Which addresses are broadcasts only the routes of this computer tell: connecting a socket of its own asks for it and
+ * sends nothing. Without a route there may be one later: that is no failure. */
+static int refuse_broadcast(struct fl_block *block, const struct state *state, const char *address)
+{
+    int fd = socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+    if (fd < 0)
+        return fl_fail(block, "cannot open a UDP socket: %s", strerror(errno));
+    bool refused = connect(fd, (const struct sockaddr *)&state->to, sizeof state->to) < 0 && errno == EACCES;
+    close(fd);
+    if (refused)
+        return fl_fail(block, "%s is the broadcast address of a network; allow it by broadcast: true", address);
+    return FL_OK;
+}
+
+static int start(struct fl_block *block)
+{
+    const struct udp_send *udp = block->parameters;
+    struct state *state = block->state;
+    int on = udp->broadcast, service = (int)udp->dscp << 2; /* above the two bits of congestion notification */
+    state->to = (struct sockaddr_in){.sin_family = AF_INET, .sin_port = htons((uint16_t)udp->port)};
+    if (udp_read_address(block, "address", udp->address, &state->to.sin_addr) != FL_OK)
+        return FL_FAILED;
+    if (!udp->broadcast && refuse_broadcast(block, state, udp->address) != FL_OK)
+        return FL_FAILED;
+    state->fd = udp_open(block, udp->local_address, 0, udp->interface);
+    if (state->fd < 0)
+        return FL_FAILED;
+    state->open = true;
+    if (setsockopt(state->fd, SOL_SOCKET, SO_BROADCAST, &on, sizeof on) < 0 ||
+        setsockopt(state->fd, IPPROTO_IP, IP_TOS, &service, sizeof service) < 0)
+        return fl_fail(block, "cannot set up the UDP socket: %s", strerror(errno));
+    return FL_OK;
+}
+
+static int step(struct fl_block *block)
+{
+    const struct udp_send *udp = block->parameters;
+    const struct state *state = block->state;
+    ssize_t sent = sendto(state->fd, block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
+                          (const struct sockaddr *)&state->to, sizeof state->to);
+    if (sent == udp->length)
+        FL_OUT(block, SENT, uint32_t)++;
+    else
+        FL_OUT(block, FAILED, uint32_t)++;
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    if (state->open)
+        close(state->fd);
+    state->open = false;
+}
+
+FL_BLOCK(udp_send) = {
+    .abi = FL_ABI,
+    .name = "udp-send",
+    .summary = "sends a datagram each step, to another robot, the station, or all in reach",
+    .source = "RFC 768; RFC 2474 for the class of service; Linux: udp(7), ip(7)",
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct udp_send),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .terminate = terminate,
+};

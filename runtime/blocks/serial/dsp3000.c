@@ -1,0 +1,250 @@
+#include "dsp3000_frame.h"
+#include "sensor.h"
+
+#include <math.h>
+
+enum { TEXT, WORDS };
+enum { CLOCKWISE, COUNTERCLOCKWISE };
+enum { IN_ZERO };
+enum { OUT_VALUE };
+
+enum {
+    REPEATS = 3, /* of a command: the gyro takes it between two of its frames, or misses it */
+    SETTLING = 5 /* lines of text that may still be of another mode, which they do not tell */
+};
+
+static const double PI = 3.14159265358979323846;
+
+struct dsp3000 {
+    FL_SERIAL_MEMBERS;
+    int format, mode, positive;
+    double full_scale, timeout;
+};
+
+static const struct fl_parameter parameters[] = {
+    FL_SERIAL_PARAMETERS(struct dsp3000, "38400"),
+    FL_PARAMETER(struct dsp3000, format, .fallback = "text", .choices = "text|words",
+                 .summary = "text: the 100 Hz gyro (-01, 38400 Bd); words: the 1000 Hz gyro (-07, 115200 Bd)"),
+    FL_PARAMETER(struct dsp3000, mode, .fallback = "rate", .choices = "rate|incremental|integrated",
+                 .summary = "what is measured: the angular rate, the angle since the last step, or since `zero`"),
+    FL_PARAMETER(struct dsp3000, positive, .fallback = "clockwise", .choices = "clockwise|counterclockwise",
+                 .summary = "sense of rotation, seen from above, that is positive; clockwise is the gyro's own"),
+    FL_PARAMETER(struct dsp3000, full_scale, .fallback = "6.545", .min = 0.01, .max = 6.545, .unit = "rad/s",
+                 .summary = "a faster rotation is not believed, whatever the gyro says"),
+    SENSOR_TIMEOUT(struct dsp3000, "0.05"),
+};
+
+static const struct fl_port inputs[] = {
+    {.name = "zero",
+     .type = FL_BOOLEAN,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "when it becomes 1, the integrated angle is counted from here"},
+};
+
+static const struct fl_port values[] = {
+    [DSP3000_RATE] = {.name = "rate", .type = FL_DOUBLE, .width = 1, .unit = "rad/s", .summary = "angular rate"},
+    [DSP3000_INCREMENTAL] = {.name = "increment",
+                             .type = FL_DOUBLE,
+                             .width = 1,
+                             .unit = "rad",
+                             .summary = "angle turned since the last step, each part of it counted once"},
+    [DSP3000_INTEGRATED] = {.name = "angle",
+                            .type = FL_DOUBLE,
+                            .width = 1,
+                            .unit = "rad",
+                            .summary = "angle since `zero`, between -pi and pi"},
+};
+
+static const struct fl_port status[] = {FL_SENSOR_OUTPUTS};
+
+/* --- the conversation --- */
+
+struct parser {
+    struct dsp3000_text text;
+    struct dsp3000_words words;
+    uint8_t repeats, settling;
+};
+
+static bool feed_text(void *parser, uint8_t byte, void *sample)
+{
+    struct parser *self = parser;
+    if (!dsp3000_text_feed(&self->text, byte, sample))
+        return false;
+    if (self->settling) {
+        self->settling--;
+        ((struct dsp3000_sample *)sample)->valid = false;
+    }
+    return true;
+}
+
+static bool feed_words(void *parser, uint8_t byte, void *sample)
+{
+    return dsp3000_words_feed(&((struct parser *)parser)->words, byte, sample);
+}
+
+static size_t send_mode(void *parser, const void *given, int silent_ms, uint8_t *out, size_t size)
+{
+    static const char commands[] = {[DSP3000_RATE] = 'R', [DSP3000_INCREMENTAL] = 'A', [DSP3000_INTEGRATED] = 'P'};
+    const struct dsp3000 *dsp3000 = given;
+    struct parser *self = parser;
+    (void)size;
+    if (silent_ms == FL_SERIAL_OPENED)
+        self->words.mode = (uint8_t)dsp3000->mode;
+    /* After a silence it may have been switched on anew, and that is in rate mode. */
+    if (silent_ms == FL_SERIAL_OPENED || silent_ms > 0) {
+        self->repeats = REPEATS;
+        self->settling = SETTLING;
+    }
+    if (silent_ms > 0 || silent_ms == FL_SERIAL_CLOSING || !self->repeats)
+        return 0;
+    self->repeats--;
+    *out = (uint8_t)commands[dsp3000->mode];
+    return 1;
+}
+
+#define PROTOCOL(waiting, take)                                                                                        \
+    {.parser_size = sizeof(struct parser),                                                                             \
+     .sample_size = sizeof(struct dsp3000_sample),                                                                     \
+     .records = (waiting),                                                                                             \
+     .feed = (take),                                                                                                   \
+     .send = send_mode}
+
+/* Increments are all needed: as many wait as come in a second. */
+static const struct fl_serial_protocol newest[] = {[TEXT] = PROTOCOL(0, feed_text), [WORDS] = PROTOCOL(0, feed_words)},
+                                       each[] = {[TEXT] = PROTOCOL(128, feed_text),
+                                                 [WORDS] = PROTOCOL(1024, feed_words)};
+
+/* --- the block --- */
+
+struct state {
+    struct fl_serial *serial;
+    struct sensor sensor;
+    double radians;     /* of a degree, with the sign */
+    double most;        /* degrees, or degrees per second, that are believed */
+    bool zero;          /* the input of the last step */
+    uint8_t zeros;      /* still to be sent, */
+    uint32_t zeroed_at; /* but not again at the same sequence */
+};
+
+static int configure(struct fl_block *block)
+{
+    const struct dsp3000 *dsp3000 = block->parameters;
+    int failed = fl_add_output(block, values[dsp3000->mode]);
+    for (size_t i = 0; i < sizeof status / sizeof status[0]; i++)
+        failed |= fl_add_output(block, status[i]);
+    return failed;
+}
+
+static int start(struct fl_block *block)
+{
+    const struct dsp3000 *dsp3000 = block->parameters;
+    struct state *state = block->state;
+    const struct fl_serial_protocol *protocols = dsp3000->mode == DSP3000_INCREMENTAL ? each : newest;
+    state->serial = fl_serial_start(block, &protocols[dsp3000->format], FL_SERIAL_SETTINGS(dsp3000), block->parameters);
+    return state->serial ? FL_OK : FL_FAILED;
+}
+
+static int initialize(struct fl_block *block)
+{
+    const struct dsp3000 *dsp3000 = block->parameters;
+    struct state *state = block->state;
+    /* The burst rate is 3 % off at most, and an increment the longer. */
+    double slowest_hz = 0.97 * (dsp3000->format == TEXT ? 100 : 1000), full_scale = dsp3000->full_scale * 180 / PI;
+    state->radians = (dsp3000->positive == CLOCKWISE ? PI : -PI) / 180;
+    state->most = dsp3000->mode == DSP3000_RATE          ? full_scale
+                  : dsp3000->mode == DSP3000_INCREMENTAL ? full_scale / slowest_hz
+                                                         : 360;
+    sensor_begin(&state->sensor);
+    return FL_OK;
+}
+
+static bool believable(const struct state *state, const struct dsp3000_sample *sample)
+{
+    return sample->valid && fabs(sample->degrees) <= state->most;
+}
+
+static void take_newest(struct fl_block *block, enum dsp3000_mode mode)
+{
+    struct state *state = block->state;
+    struct dsp3000_sample sample;
+    int64_t arrived_ns;
+    uint32_t sequence;
+    if (!fl_serial_newest(state->serial, &sample, &arrived_ns, &sequence))
+        return;
+    double value = sample.degrees * state->radians;
+    if (sensor_take(&state->sensor, believable(state, &sample), arrived_ns, sequence))
+        FL_OUT(block, OUT_VALUE, double) = mode == DSP3000_RATE ? value : remainder(value, 2 * PI);
+}
+
+/* The sum of all increments since the last step. One that is bad or lost leaves a sum that is wrong. */
+static void take_each(struct fl_block *block)
+{
+    struct state *state = block->state;
+    struct dsp3000_sample sample;
+    int64_t arrived_ns;
+    uint32_t sequence;
+    double sum = 0;
+    bool good = true;
+    while (fl_serial_next(state->serial, &sample, &arrived_ns, &sequence)) {
+        good = good && believable(state, &sample) && sequence == state->sensor.sequence + 1;
+        sum += sample.degrees * state->radians;
+        sensor_take(&state->sensor, good, arrived_ns, sequence);
+    }
+    FL_OUT(block, OUT_VALUE, double) = good ? sum : 0;
+}
+
+/* The gyro may miss a command, and does not say whether it took it: so it comes again, after each of the next frames.
+ */
+static void zero(struct fl_block *block)
+{
+    struct state *state = block->state;
+    bool wanted = FL_IN(block, IN_ZERO, bool);
+    if (wanted && !state->zero) {
+        state->zeros = REPEATS;
+        state->zeroed_at = state->sensor.sequence - 1;
+    }
+    state->zero = wanted;
+    if (state->zeros && state->zeroed_at != state->sensor.sequence &&
+        fl_serial_send(state->serial, (const uint8_t *)"Z", 1)) {
+        state->zeros--;
+        state->zeroed_at = state->sensor.sequence;
+    }
+}
+
+static int step(struct fl_block *block)
+{
+    const struct dsp3000 *dsp3000 = block->parameters;
+    struct state *state = block->state;
+    if (dsp3000->mode == DSP3000_INCREMENTAL)
+        take_each(block);
+    else
+        take_newest(block, (enum dsp3000_mode)dsp3000->mode);
+    if (dsp3000->mode == DSP3000_INTEGRATED)
+        zero(block);
+    sensor_outputs(&state->sensor, block, fl_serial_connected(state->serial), dsp3000->timeout);
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    fl_serial_stop(state->serial);
+    state->serial = NULL;
+}
+
+FL_BLOCK(dsp3000) = {
+    .abi = FL_ABI,
+    .name = "dsp3000",
+    .summary = "KVH DSP-3000 fibre-optic gyro on a serial port",
+    .source = "KVH DSP-3000 technical manual 54-0215 Rev. C, sections 2 and 3",
+    FL_TABLE(input, inputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct dsp3000),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .initialize = initialize,
+    .step = step,
+    .terminate = terminate,
+};

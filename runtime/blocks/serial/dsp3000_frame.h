@@ -1,0 +1,46 @@
+/* What a KVH DSP-3000 gyro sends. Technical manual 54-0215 Rev. C: section 2.1 (text, 100 Hz), 3.1 (words, 1000 Hz). */
+#ifndef FLOTILLA_DSP3000_FRAME_H
+#define FLOTILLA_DSP3000_FRAME_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* As the type bits of a word count them. */
+enum dsp3000_mode { DSP3000_RATE, DSP3000_INCREMENTAL, DSP3000_INTEGRATED };
+
+struct dsp3000_sample {
+    double degrees; /* or degrees per second */
+    bool valid;     /* the gyro's own judgement */
+};
+
+/* A line of text, "(-)xxx.xxxxxx y" with spaces around the two, ended by CR LF. It has no checksum: what does not look
+ * like this to the last digit is dropped. */
+enum { DSP3000_LINE = 30 };
+
+struct dsp3000_text {
+    char line[DSP3000_LINE];
+    uint8_t length;
+    bool overlong; /* or not text: wait for the next line */
+};
+
+bool dsp3000_text_feed(struct dsp3000_text *text, uint8_t byte, struct dsp3000_sample *sample);
+
+/* Words of four bytes, the most significant first, without anything between them that says where one begins: bit 31
+ * valid, 30-29 synchronisation, 28-27 mode, 26 odd parity of the whole, 25-0 two's complement. So all four ways to cut
+ * the stream are tried at once, and the one is believed that has been right for some time when the others were not. */
+struct dsp3000_words {
+    uint8_t mode;     /* enum dsp3000_mode that is expected: words of another are wrong */
+    uint32_t window;  /* the last four bytes */
+    uint8_t received; /* bytes, until there are four */
+    uint8_t phase;    /* of the next byte */
+    uint8_t trust[4]; /* by phase of the word's last byte */
+};
+
+enum {
+    DSP3000_TRUSTED = 8, /* words in a row before one is used: 2^-8 by parity alone, and the values must be possible */
+    DSP3000_DISTRUST = 4 /* what a wrong word costs: after a single one the stream is back in four milliseconds */
+};
+
+bool dsp3000_words_feed(struct dsp3000_words *words, uint8_t byte, struct dsp3000_sample *sample);
+
+#endif

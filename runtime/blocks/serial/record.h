@@ -1,0 +1,28 @@
+/* Text records on a serial line: a start character, printable text, an end character, and two hexadecimal digits that
+ * are the exclusive or of the text. NMEA 0183 has $...*HH, OceanServer $...%HH. */
+#ifndef FLOTILLA_SERIAL_RECORD_H
+#define FLOTILLA_SERIAL_RECORD_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+enum { RECORD_TEXT = 120 };
+
+struct record {
+    char text[RECORD_TEXT + 1]; /* between $ and the end character, terminated by 0 */
+    uint8_t length;
+    uint8_t state;
+    uint8_t computed, claimed; /* checksums */
+};
+
+/* Take one byte of records that `end` ends. True when it completed one, its checksum still to be judged: the text is in
+ * record->text then. */
+bool record_feed(struct record *record, uint8_t byte, char end);
+
+static inline bool record_sound(const struct record *record)
+{
+    return record->computed == record->claimed;
+}
+
+#endif

@@ -1,0 +1,68 @@
+#include <flotilla/block.h>
+#include <math.h>
+
+struct limit {
+    double min, max, rate, initial;
+};
+
+static const struct fl_parameter parameters[] = {
+    FL_PARAMETER(struct limit, min, .flags = FL_TUNABLE, .summary = "least output"),
+    FL_PARAMETER(struct limit, max, .flags = FL_TUNABLE, .summary = "greatest output"),
+    FL_PARAMETER(struct limit, rate, .flags = FL_TUNABLE, .fallback = "0", .max = INFINITY, .unit = "1/s",
+                 .summary = "fastest change of the output, either way; 0: any"),
+    FL_PARAMETER(struct limit, initial, .fallback = "0",
+                 .summary = "output at time zero, from where the first change is limited"),
+};
+
+static const struct fl_port inputs[] = {{.name = "in", .type = FL_DOUBLE, .width = 1, .summary = "any signal"}};
+
+static const struct fl_port outputs[] = {
+    {.name = "out", .type = FL_DOUBLE, .width = 1, .summary = "in, limited; while in is not a number, what it was"},
+    {.name = "limited", .type = FL_BOOLEAN, .width = 1, .summary = "1: out is not in"},
+};
+
+static double clamped(const struct limit *limit, double value)
+{
+    return fmin(fmax(value, limit->min), limit->max);
+}
+
+static int configure(struct fl_block *block)
+{
+    const struct limit *limit = block->parameters;
+    if (limit->min > limit->max)
+        return fl_fail(block, "min %g is above max %g", limit->min, limit->max);
+    return FL_OK;
+}
+
+static int initialize(struct fl_block *block)
+{
+    const struct limit *limit = block->parameters;
+    FL_OUT(block, 0, double) = clamped(limit, limit->initial);
+    return FL_OK;
+}
+
+static int step(struct fl_block *block)
+{
+    const struct limit *limit = block->parameters;
+    double in = FL_IN(block, 0, double), before = FL_OUT(block, 0, double);
+    double change = limit->rate > 0 ? limit->rate * 1e-9 * (double)block->period_ns : INFINITY;
+    /* The range wins over the rate: it may have been tuned to end below where the output is. */
+    double out = isnan(in) ? before : clamped(limit, fmin(fmax(in, before - change), before + change));
+    FL_OUT(block, 0, double) = out;
+    FL_OUT(block, 1, bool) = !(out == in);
+    return FL_OK;
+}
+
+FL_BLOCK(limit) = {
+    .abi = FL_ABI,
+    .name = "limit",
+    .summary = "keeps a signal in a range, and its change below a rate",
+    .source = "Simulink's blocks Saturation and Rate Limiter",
+    FL_TABLE(input, inputs),
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct limit),
+    .configure = configure,
+    .initialize = initialize,
+    .step = step,
+};

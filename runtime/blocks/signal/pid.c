@@ -1,0 +1,149 @@
+#include <flotilla/block.h>
+#include <math.h>
+
+enum anti_windup { CLAMPING, BACK_CALCULATION, NONE };
+enum { SET_POINT, MEASUREMENT, FEED_FORWARD, RESET };
+enum { OUT, SATURATED };
+
+struct pid {
+    double kp, ki, kd, filter, min, max, tracking, turn;
+    int anti_windup;
+};
+
+/* The integral is kept with its gain and the derivative without, so that neither tuning ki nor kd makes a jump of what
+ * has been gathered. */
+struct state {
+    double integral;    /* part of the output */
+    double derivative;  /* of the measurement, filtered */
+    double measurement; /* of the step before */
+    bool begun;         /* there was a step before */
+};
+
+static const struct fl_parameter parameters[] = {
+    FL_PARAMETER(struct pid, kp, .flags = FL_TUNABLE, .fallback = "0", .summary = "gain of the error"),
+    FL_PARAMETER(struct pid, ki, .flags = FL_TUNABLE, .fallback = "0", .unit = "1/s",
+                 .summary = "gain of the error's integral"),
+    FL_PARAMETER(struct pid, kd, .flags = FL_TUNABLE, .fallback = "0", .unit = "s",
+                 .summary = "gain of the measurement's derivative, which is subtracted"),
+    FL_PARAMETER(struct pid, filter, .flags = FL_TUNABLE, .fallback = "0", .max = INFINITY, .unit = "s",
+                 .summary = "time constant of the derivative's low-pass filter; 0: none"),
+    FL_PARAMETER(struct pid, min, .flags = FL_TUNABLE, .summary = "least output"),
+    FL_PARAMETER(struct pid, max, .flags = FL_TUNABLE, .summary = "greatest output"),
+    FL_PARAMETER(struct pid, anti_windup, .fallback = "clamping", .choices = "clamping|back-calculation|none",
+                 .summary = "clamping: the integral waits while the output is limited and the error would drive it "
+                            "further; back-calculation: it is led back within `tracking`"),
+    FL_PARAMETER(struct pid, tracking, .fallback = "1", .min = 1e-6, .max = INFINITY, .unit = "s",
+                 .summary = "time constant of back-calculation"),
+    FL_PARAMETER(struct pid, turn, .fallback = "0", .max = INFINITY,
+                 .summary = "for an angle: its full turn (360, 6.283185307179586), so that the error is the short way "
+                            "round; 0: no angle"),
+};
+
+static const struct fl_port inputs[] = {
+    {.name = "set_point", .type = FL_DOUBLE, .width = 1, .summary = "what the measurement shall be"},
+    {.name = "measurement", .type = FL_DOUBLE, .width = 1, .summary = "what it is"},
+    {.name = "feed_forward", .type = FL_DOUBLE, .width = 1, .flags = FL_OPTIONAL, .summary = "added to the output"},
+    {.name = "reset",
+     .type = FL_BOOLEAN,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "1: out is zero, limited, and the integral and the derivative begin anew"},
+};
+
+static const struct fl_port outputs[] = {
+    {.name = "out",
+     .type = FL_DOUBLE,
+     .width = 1,
+     .summary = "the command; zero, limited, in a step whose inputs are not all finite"},
+    {.name = "saturated", .type = FL_BOOLEAN, .width = 1, .summary = "1: out is at min or max"},
+};
+
+static double limited(const struct pid *pid, double value)
+{
+    return fmin(fmax(value, pid->min), pid->max);
+}
+
+static double difference(const struct pid *pid, double to, double from)
+{
+    return pid->turn > 0 ? remainder(to - from, pid->turn) : to - from;
+}
+
+static int configure(struct fl_block *block)
+{
+    const struct pid *pid = block->parameters;
+    if (pid->min > pid->max)
+        return fl_fail(block, "min %g is above max %g", pid->min, pid->max);
+    return FL_OK;
+}
+
+static void rest(struct fl_block *block)
+{
+    FL_OUT(block, OUT, double) = limited(block->parameters, 0);
+    FL_OUT(block, SATURATED, bool) = false;
+}
+
+static int initialize(struct fl_block *block)
+{
+    struct state *state = block->state;
+    *state = (struct state){0};
+    rest(block);
+    return FL_OK;
+}
+
+static void integrate(const struct pid *pid, struct state *state, double h, double error, double wanted, double out)
+{
+    double growth = pid->ki * h * error;
+    switch (pid->anti_windup) {
+    case CLAMPING:
+        if ((wanted > out && growth > 0) || (wanted < out && growth < 0))
+            growth = 0;
+        break;
+    case BACK_CALCULATION:
+        growth += h / fmax(pid->tracking, h) * (out - wanted);
+        break;
+    case NONE:
+        break;
+    }
+    if (isfinite(state->integral + growth))
+        state->integral += growth;
+}
+
+static int step(struct fl_block *block)
+{
+    const struct pid *pid = block->parameters;
+    struct state *state = block->state;
+    double h = 1e-9 * (double)block->period_ns, measurement = FL_IN(block, MEASUREMENT, double);
+    double error = difference(pid, FL_IN(block, SET_POINT, double), measurement);
+    if (FL_IN(block, RESET, uint8_t))
+        return initialize(block);
+    double change = difference(pid, measurement, state->measurement);
+    state->derivative = state->begun ? (pid->filter * state->derivative + change) / (pid->filter + h) : 0;
+    state->measurement = measurement;
+    double wanted =
+        pid->kp * error + state->integral - pid->kd * state->derivative + FL_IN(block, FEED_FORWARD, double);
+    state->begun = isfinite(wanted) && isfinite(state->derivative); /* otherwise the derivative begins anew */
+    if (!state->begun) {
+        rest(block);
+        return FL_OK;
+    }
+    double out = limited(pid, wanted);
+    integrate(pid, state, h, error, wanted, out);
+    FL_OUT(block, OUT, double) = out;
+    FL_OUT(block, SATURATED, bool) = out < wanted || out > wanted;
+    return FL_OK;
+}
+
+FL_BLOCK(pid) = {
+    .abi = FL_ABI,
+    .name = "pid",
+    .summary = "PID controller: parallel form, derivative of the measurement, limited output",
+    .source = "Åström, Murray, Feedback Systems, 2nd edition, section 11.5",
+    FL_TABLE(input, inputs),
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct pid),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .initialize = initialize,
+    .step = step,
+};

@@ -1,0 +1,221 @@
+#define _GNU_SOURCE
+#include "testbed.h"
+
+#include "hub.h"
+
+#include <flotilla/block.h>
+#include <linux/can/error.h>
+
+static struct can_frame frame_of(canid_t id, uint8_t length, const char *data)
+{
+    struct can_frame frame = {.can_id = id};
+    frame.len = length;
+    memcpy(frame.data, data, length);
+    return frame;
+}
+
+static void put(canid_t id, uint8_t length, const char *data)
+{
+    struct can_frame frame = frame_of(id, length, data);
+    hub_put(&frame);
+}
+
+static struct fl_block *receiver(const char *id, const char *mask, const char *extended)
+{
+    struct can_frame none;
+    struct fl_block *block =
+        testbed_block("can-receive", "id", id, "mask", mask, "extended", extended, "timeout", "30", NULL);
+    testbed_begin(block);
+    assert_false(hub_take(&none)); /* it is known to the hub now */
+    return block;
+}
+
+static void receives_the_newest(void **state)
+{
+    (void)state;
+    hub_open();
+    struct fl_block *block = receiver("0x123", "0x7FF", "false");
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", uint8_t), 0);
+    assert_int_equal(GET(block, "sequence", uint32_t), 0);
+    put(0x123, 8, "abcdefgh");
+    put(0x123, 3, "xyz");
+    block->release_ns = fl_now_ns(); /* from here on the test's time: no matter how fast the computer is */
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_memory_equal(testbed_output(block, "data"), "xyz\0\0\0\0\0", 8);
+    assert_int_equal(GET(block, "length", uint8_t), 3);
+    assert_int_equal(GET(block, "id", uint32_t), 0x123);
+    assert_int_equal(GET(block, "flag", uint8_t), 1);
+    assert_int_equal(GET(block, "sequence", uint32_t), 2);
+    double age = GET(block, "age", double);
+    assert_true(age >= 0.01);
+    assert_int_equal(testbed_step(block), FL_OK); /* nothing new: it ages by a period */
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_near(GET(block, "age", double), age + 0.02, 1e-9);
+    testbed_end(block);
+    hub_close();
+}
+
+/* The stamp is of the arrival in the kernel, not of the step that fetched the frame. */
+static void ages_from_the_kernels_stamp(void **state)
+{
+    (void)state;
+    hub_open();
+    struct fl_block *block = receiver("0x123", "0x7FF", "false");
+    put(0x123, 1, "a");
+    int64_t put_ns = fl_now_ns();
+    while (fl_now_ns() - put_ns < 5000000)
+        ;
+    block->release_ns = fl_now_ns() - block->period_ns;
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_true(GET(block, "age", double) >= 0.005);
+    testbed_end(block);
+    hub_close();
+}
+
+static void goes_bad_with_age(void **state)
+{
+    (void)state;
+    struct can_frame none;
+    hub_open();
+    struct fl_block *block = testbed_block("can-receive", "id", "1", "timeout", "0.1", NULL);
+    testbed_begin(block);
+    assert_false(hub_take(&none));
+    put(1, 1, "a");
+    block->release_ns = fl_now_ns();
+    for (int step = 0; step < 20; step++) {
+        assert_int_equal(testbed_step(block), FL_OK);
+        assert_int_equal(GET(block, "flag", uint8_t), GET(block, "age", double) <= 0.1);
+    }
+    assert_true(GET(block, "age", double) > 0.1);
+    assert_int_equal(GET(block, "sequence", uint32_t), 1);
+    testbed_end(block);
+    hub_close();
+}
+
+static void filters(void **state)
+{
+    (void)state;
+    hub_open();
+    struct fl_block *standard = receiver("0x120", "0x7F0", "false"),
+                    *extended = receiver("0x18DAF110", "0x1FFFFFFF", "true");
+    put(0x128, 1, "m");
+    put(0x130, 1, "n");                /* outside the mask */
+    put(0x120 | CAN_EFF_FLAG, 1, "e"); /* of the other format */
+    put(0x120 | CAN_RTR_FLAG, 0, "");  /* a request, no data */
+    put(0x18DAF110 | CAN_EFF_FLAG, 2, "xt");
+    assert_int_equal(testbed_step(standard), FL_OK);
+    assert_int_equal(GET(standard, "sequence", uint32_t), 1);
+    assert_int_equal(GET(standard, "id", uint32_t), 0x128);
+    assert_int_equal(testbed_step(extended), FL_OK);
+    assert_int_equal(GET(extended, "sequence", uint32_t), 1);
+    assert_int_equal(GET(extended, "id", uint32_t), 0x18DAF110);
+    testbed_end(standard);
+    testbed_end(extended);
+    hub_close();
+}
+
+static void bus_off_is_no_good(void **state)
+{
+    (void)state;
+    hub_open();
+    struct fl_block *block = receiver("5", "0x7FF", "false");
+    put(5, 1, "a");
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", uint8_t), 1);
+    put(CAN_ERR_FLAG | CAN_ERR_BUSOFF, 8, "\0\0\0\0\0\0\0\0");
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", uint8_t), 0);
+    put(CAN_ERR_FLAG | CAN_ERR_RESTARTED, 8, "\0\0\0\0\0\0\0\0");
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", uint8_t), 1);
+    put(CAN_ERR_FLAG | CAN_ERR_BUSOFF, 8, "\0\0\0\0\0\0\0\0");
+    put(5, 1, "b"); /* the bus is alive again, said or not */
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", uint8_t), 1);
+    assert_int_equal(GET(block, "sequence", uint32_t), 2);
+    testbed_end(block);
+    hub_close();
+}
+
+static void sends(void **state)
+{
+    (void)state;
+    struct can_frame frame;
+    hub_open();
+    struct fl_block *block = testbed_block("can-send", "id", "0x18DAF110", "extended", "true", "length", "3", NULL);
+    testbed_begin(block);
+    memcpy(testbed_input(block, "data"), "abc", 3);
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_true(hub_take(&frame));
+    assert_int_equal(frame.can_id, 0x18DAF110 | CAN_EFF_FLAG);
+    assert_int_equal(frame.len, 3);
+    assert_memory_equal(frame.data, "abc\0\0\0\0\0", 8);
+    assert_int_equal(GET(block, "flag", uint8_t), 1);
+    assert_int_equal(GET(block, "sent", uint32_t), 1);
+    testbed_end(block);
+    assert_false(hub_take(&frame)); /* no reset was asked for */
+    hub_close();
+}
+
+static void resets_what_is_old(void **state)
+{
+    (void)state;
+    struct can_frame frame;
+    hub_open();
+    struct fl_block *block =
+        testbed_block("can-send", "id", "0x77", "length", "2", "reset", "00fF", "timeout", "0.1", NULL);
+    testbed_begin(block);
+    memcpy(testbed_input(block, "data"), "ab", 2);
+    SET(block, "age", double, 0.1);
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_true(hub_take(&frame));
+    assert_memory_equal(frame.data, "ab", 2);
+    SET(block, "age", double, 0.11);
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_true(hub_take(&frame));
+    assert_memory_equal(frame.data, "\x00\xFF", 2);
+    block->type->safe(block);
+    assert_true(hub_take(&frame));
+    assert_memory_equal(frame.data, "\x00\xFF", 2);
+    testbed_end(block);
+    assert_true(hub_take(&frame));
+    assert_int_equal(frame.can_id, 0x77);
+    assert_int_equal(frame.len, 2);
+    assert_memory_equal(frame.data, "\x00\xFF", 2);
+    hub_close();
+}
+
+static void refuses(void **state)
+{
+    (void)state;
+    assert_non_null(strstr(testbed_refusal("can-receive", "id", "0x800", NULL), "more than 11 bits: set `extended`"));
+    assert_non_null(strstr(testbed_refusal("can-send", "id", "0x800", NULL), "more than 11 bits: set `extended`"));
+    assert_non_null(strstr(testbed_refusal("can-send", "id", "1", "reset", "00", NULL), "is not 8 bytes"));
+    assert_non_null(
+        strstr(testbed_refusal("can-send", "id", "1", "length", "1", "reset", "0g", NULL), "is not 1 bytes"));
+    assert_non_null(
+        strstr(testbed_refusal("can-send", "id", "1", "length", "1", "reset", "0", NULL), "is not 1 bytes"));
+}
+
+static void needs_its_interface(void **state)
+{
+    (void)state;
+    hub_open();
+    struct fl_block *block = testbed_block("can-receive", "id", "1", "interface", "can9", NULL);
+    assert_int_equal(block->type->start(block), FL_FAILED);
+    testbed_end(block);
+    hub_close();
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(receives_the_newest), cmocka_unit_test(ages_from_the_kernels_stamp),
+        cmocka_unit_test(goes_bad_with_age),   cmocka_unit_test(filters),
+        cmocka_unit_test(bus_off_is_no_good),  cmocka_unit_test(sends),
+        cmocka_unit_test(resets_what_is_old),  cmocka_unit_test(refuses),
+        cmocka_unit_test(needs_its_interface),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}

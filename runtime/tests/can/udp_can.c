@@ -1,0 +1,120 @@
+/* CAN on a computer without: sockets of the family AF_CAN become UDP sockets to a hub on 127.0.0.1, whose port is in
+ * $CAN_HUB; a datagram is a struct can_frame, and an empty one makes a socket known. Filters, reports and time stamps
+ * behave as the kernel's, as far as the runtime uses them. Included by tests, and a shared object for LD_PRELOAD, so
+ * that the code under test is what robots run. */
+#ifndef _GNU_SOURCE
+#define _GNU_SOURCE
+#endif
+#include <dlfcn.h>
+#include <errno.h>
+#include <linux/can.h>
+#include <linux/can/raw.h>
+#include <net/if.h>
+#include <netinet/in.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+enum { UDP_CAN_SOCKETS = 64, UDP_CAN_FILTERS = 16, UDP_CAN_INDEX = 7 };
+
+/* By descriptor. A new socket receives all frames and no reports, as the kernel's. */
+static struct udp_can {
+    bool is_can;
+    struct can_filter filters[UDP_CAN_FILTERS];
+    size_t filter_count;
+    can_err_mask_t reports;
+} udp_cans[UDP_CAN_SOCKETS];
+
+static void *udp_can_real(const char *name)
+{
+    void *real = dlsym(RTLD_NEXT, name);
+    if (!real)
+        abort();
+    return real;
+}
+
+static struct udp_can *udp_can_of(int fd)
+{
+    return fd >= 0 && fd < UDP_CAN_SOCKETS && udp_cans[fd].is_can ? &udp_cans[fd] : NULL;
+}
+
+unsigned if_nametoindex(const char *name)
+{
+    if (getenv("CAN_HUB") && strcmp(name, "can0") == 0)
+        return UDP_CAN_INDEX;
+    errno = ENODEV;
+    return 0;
+}
+
+int socket(int domain, int type, int protocol)
+{
+    bool is_can = domain == AF_CAN && getenv("CAN_HUB");
+    int fd = (int)(is_can ? syscall(SYS_socket, AF_INET, SOCK_DGRAM | (type & (SOCK_NONBLOCK | SOCK_CLOEXEC)), 0)
+                          : syscall(SYS_socket, domain, type, protocol));
+    if (fd >= 0 && fd < UDP_CAN_SOCKETS)
+        udp_cans[fd] = (struct udp_can){.is_can = is_can, .filters = {{0, 0}}, .filter_count = 1};
+    else if (is_can)
+        abort();
+    return fd;
+}
+
+int setsockopt(int fd, int level, int option, const void *value, socklen_t size)
+{
+    struct udp_can *can = udp_can_of(fd);
+    if (can && level == SOL_CAN_RAW && option == CAN_RAW_FILTER && size <= sizeof can->filters) {
+        if (size)
+            memcpy(can->filters, value, size);
+        can->filter_count = size / sizeof can->filters[0];
+        return 0;
+    }
+    if (can && level == SOL_CAN_RAW && option == CAN_RAW_ERR_FILTER && size == sizeof can->reports) {
+        memcpy(&can->reports, value, size);
+        return 0;
+    }
+    return ((int (*)(int, int, int, const void *, socklen_t))(uintptr_t)udp_can_real("setsockopt"))(fd, level, option,
+                                                                                                    value, size);
+}
+
+int bind(int fd, const struct sockaddr *address, socklen_t size)
+{
+    if (!udp_can_of(fd))
+        return ((int (*)(int, const struct sockaddr *, socklen_t))(uintptr_t)udp_can_real("bind"))(fd, address, size);
+    const struct sockaddr_can *asked = (const struct sockaddr_can *)(const void *)address;
+    struct sockaddr_in hub = {.sin_family = AF_INET,
+                              .sin_port = htons((uint16_t)atoi(getenv("CAN_HUB"))),
+                              .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
+    if (asked->can_ifindex != UDP_CAN_INDEX && asked->can_ifindex != 0) {
+        errno = ENODEV;
+        return -1;
+    }
+    if (connect(fd, (struct sockaddr *)&hub, sizeof hub) < 0 || send(fd, "", 0, 0) < 0)
+        return -1;
+    return 0;
+}
+
+static bool udp_can_passes(const struct udp_can *can, const struct can_frame *frame)
+{
+    if (frame->can_id & CAN_ERR_FLAG)
+        return frame->can_id & can->reports;
+    for (size_t i = 0; i < can->filter_count; i++)
+        if ((frame->can_id & can->filters[i].can_mask) == (can->filters[i].can_id & can->filters[i].can_mask))
+            return true;
+    return false;
+}
+
+ssize_t recvmsg(int fd, struct msghdr *message, int flags)
+{
+    const struct udp_can *can = udp_can_of(fd);
+    size_t room = message->msg_controllen;
+    for (;;) {
+        message->msg_controllen = room;
+        ssize_t count =
+            ((ssize_t (*)(int, struct msghdr *, int))(uintptr_t)udp_can_real("recvmsg"))(fd, message, flags);
+        if (!can || count < 0 || udp_can_passes(can, message->msg_iov[0].iov_base))
+            return count;
+    }
+}

@@ -1,0 +1,376 @@
+/* The serial port itself, with a pseudo terminal for a device. */
+#define _GNU_SOURCE
+#include "serial/line.h"
+
+#include <asm/termbits.h>
+#include <errno.h>
+#include <flotilla/driver.h>
+#include <stdatomic.h>
+#include <sys/ioctl.h>
+#include <sys/syscall.h>
+
+/* --- what reaches the kernel: ptys ignore most settings, so the call itself is watched --- */
+
+static struct termios2 asked;
+static speed_t pretended; /* the rate that the port says it has; 0: what it was asked for */
+static _Atomic unsigned exclusions;
+
+int ioctl(int fd, unsigned long request, ...)
+{
+    va_list arguments;
+    va_start(arguments, request);
+    void *argument = va_arg(arguments, void *);
+    va_end(arguments);
+    if (request == TCSETS2)
+        asked = *(const struct termios2 *)argument;
+    if (request == TIOCEXCL)
+        exclusions++;
+    int result = (int)syscall(SYS_ioctl, fd, request, argument);
+    if (request == TCGETS2 && pretended)
+        ((struct termios2 *)argument)->c_ospeed = pretended;
+    return result;
+}
+
+static const struct termios2 *settings_of(struct line *line, int64_t baud, int64_t data, int64_t stop, int parity)
+{
+    static struct termios2 set;
+    int fd = fl_serial_open(&(struct fl_serial_settings){line->path, baud, data, stop, parity});
+    assert_true(fd >= 0);
+    assert_int_equal(ioctl(fd, TCGETS2, &set), 0);
+    close(fd);
+    return &set;
+}
+
+static void settings_reach_the_port(void **state)
+{
+    (void)state;
+    struct line line = line_create();
+    enum { NONE, ODD, EVEN };
+    const unsigned watched = CSIZE | PARENB | PARODD | CSTOPB | CREAD | CLOCAL;
+
+    /* What a pty keeps: the rate, any, and the stop bits. */
+    assert_int_equal(settings_of(&line, 38400, 8, 1, NONE)->c_ospeed, 38400);
+    assert_int_equal(settings_of(&line, 31250, 8, 1, NONE)->c_ospeed, 31250);
+    assert_int_equal(settings_of(&line, 31250, 8, 1, NONE)->c_ispeed, 31250);
+    assert_true(settings_of(&line, 9600, 8, 2, NONE)->c_cflag & CSTOPB);
+    assert_false(settings_of(&line, 9600, 8, 1, NONE)->c_cflag & CSTOPB);
+    assert_true(settings_of(&line, 9600, 8, 1, ODD)->c_cflag & PARODD);
+
+    /* What is asked for. */
+    settings_of(&line, 9600, 8, 1, NONE);
+    assert_int_equal(asked.c_cflag & watched, CS8 | CREAD | CLOCAL);
+    assert_int_equal(asked.c_iflag, IGNBRK);
+    assert_int_equal(asked.c_oflag | asked.c_lflag, 0);
+    settings_of(&line, 9600, 7, 2, EVEN);
+    assert_int_equal(asked.c_cflag & watched, CS7 | PARENB | CSTOPB | CREAD | CLOCAL);
+    assert_int_equal(asked.c_iflag, IGNBRK | INPCK); /* a wrong parity bit turns the byte into 0 */
+    settings_of(&line, 9600, 5, 1, ODD);
+    assert_int_equal(asked.c_cflag & watched, CS5 | PARENB | PARODD | CREAD | CLOCAL);
+    line_unplug(&line);
+}
+
+static void refuses_a_rate_that_the_port_lacks(void **state)
+{
+    (void)state;
+    struct line line = line_create();
+    struct fl_serial_settings settings = {line.path, 250000, 8, 1, 0};
+    pretended = 230400;
+    assert_int_equal(fl_serial_open(&settings), -1);
+    assert_int_equal(errno, ERANGE);
+    pretended = 246000; /* a divisor that fits well enough */
+    int fd = fl_serial_open(&settings);
+    assert_true(fd >= 0);
+    close(fd);
+    pretended = 0;
+    line_unplug(&line);
+}
+
+/* --- the thread: a device that sends bytes, each of them a measurement --- */
+
+enum { LOUD = 64 };
+
+struct probe {
+    FL_SERIAL_MEMBERS;
+    int send; /* nothing; what it is called with; LOUD bytes at each batch */
+};
+enum { SEND_NOTHING, SEND_REASON, SEND_LOUD };
+
+static const struct fl_parameter parameters[] = {
+    FL_SERIAL_PARAMETERS(struct probe, "9600"),
+    FL_PARAMETER(struct probe, send, .fallback = "nothing", .choices = "nothing|reason|loud", .summary = "replies"),
+};
+
+struct counted {
+    unsigned char fed, value;
+};
+
+static bool feed(void *parser, uint8_t byte, void *sample)
+{
+    unsigned char *fed = parser;
+    *(struct counted *)sample = (struct counted){++*fed, byte};
+    return byte != 0;
+}
+
+static size_t send_something(void *parser, const void *given, int silent_ms, uint8_t *out, size_t size)
+{
+    (void)parser;
+    const struct probe *probe = given;
+    memset(out, '.', size);
+    if (probe->send == SEND_LOUD)
+        return silent_ms == 0 ? LOUD : 0;
+    if (probe->send == SEND_NOTHING)
+        return 0;
+    *out = silent_ms == FL_SERIAL_OPENED ? 'o' : silent_ms == FL_SERIAL_CLOSING ? 'c' : silent_ms == 0 ? 'b' : 's';
+    return 1;
+}
+
+#define PROTOCOL(waiting)                                                                                              \
+    {.parser_size = 1,                                                                                                 \
+     .sample_size = sizeof(struct counted),                                                                            \
+     .records = (waiting),                                                                                             \
+     .feed = feed,                                                                                                     \
+     .send = send_something}
+static const struct fl_serial_protocol newest = PROTOCOL(0), each = PROTOCOL(8);
+
+static int step(struct fl_block *block)
+{
+    (void)block;
+    return FL_OK;
+}
+
+FL_BLOCK(probe) = {
+    .abi = FL_ABI,
+    .name = "probe",
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct probe),
+    .step = step,
+};
+
+struct bench {
+    struct line line;
+    struct fl_block *block;
+    struct fl_serial *serial;
+    struct counted counted;
+    int64_t arrived_ns;
+    uint32_t sequence;
+};
+
+static struct bench bench_create(const struct fl_serial_protocol *protocol, const char *send)
+{
+    struct bench bench = {.line = line_create()};
+    bench.block = testbed_block("probe", "device", bench.line.path, "send", send, NULL);
+    const struct probe *probe = bench.block->parameters;
+    bench.serial = fl_serial_start(bench.block, protocol, FL_SERIAL_SETTINGS(probe), probe);
+    assert_non_null(bench.serial);
+    AWAIT(fl_serial_connected(bench.serial));
+    return bench;
+}
+
+static bool take_newest(struct bench *bench)
+{
+    return fl_serial_newest(bench->serial, &bench->counted, &bench->arrived_ns, &bench->sequence);
+}
+
+static bool take_next(struct bench *bench)
+{
+    return fl_serial_next(bench->serial, &bench->counted, &bench->arrived_ns, &bench->sequence);
+}
+
+static void bench_destroy(struct bench *bench)
+{
+    fl_serial_stop(bench->serial);
+    if (bench->line.master >= 0)
+        line_unplug(&bench->line);
+    testbed_end(bench->block);
+}
+
+static void newest_is_the_newest_however_slow_the_step(void **state)
+{
+    (void)state;
+    struct bench bench = bench_create(&newest, "reason");
+    assert_false(take_newest(&bench));
+    int64_t before_ns = fl_now_ns();
+    for (int i = 0; i < 1000; i++)
+        line_say(&bench.line, i < 999 ? "x" : "y");
+    AWAIT(take_newest(&bench) && bench.counted.value == 'y');
+    assert_int_equal(bench.sequence, 1000);
+    assert_true(bench.arrived_ns >= before_ns && bench.arrived_ns <= fl_now_ns());
+    assert_false(take_newest(&bench));
+
+    /* Nobody takes these while they come, and they are more than a queue would be long. */
+    char many[500];
+    memset(many, 'x', sizeof many);
+    many[sizeof many - 1] = 'z';
+    line_write(&bench.line, many, sizeof many);
+    assert_true(line_hears(&bench.line, "bs"));
+    assert_true(take_newest(&bench));
+    assert_int_equal(bench.counted.value, 'z');
+    assert_int_equal(bench.sequence, 1500);
+    bench_destroy(&bench);
+}
+
+static void each_in_turn_and_what_is_lost_is_seen(void **state)
+{
+    (void)state;
+    struct bench bench = bench_create(&each, "reason");
+    line_say(&bench.line, "abc");
+    assert_true(line_hears(&bench.line, "b")); /* the batch is done */
+    for (const char *expected = "abc"; *expected; expected++) {
+        AWAIT(take_next(&bench));
+        assert_int_equal(bench.counted.value, *expected);
+    }
+    assert_int_equal(bench.sequence, 3);
+    line_say(&bench.line, "0123456789ab");
+    assert_true(line_hears(&bench.line, "b"));
+    AWAIT(take_newest(&bench));
+    assert_int_equal(bench.sequence, 11);
+    assert_int_equal(bench.counted.value, '7');
+    line_say(&bench.line, "z");
+    AWAIT(take_next(&bench));
+    assert_int_equal(bench.sequence, 16);
+    bench_destroy(&bench);
+}
+
+static void comes_back_after_unplugging(void **state)
+{
+    (void)state;
+    struct bench bench = bench_create(&newest, "reason");
+    assert_true(line_hears(&bench.line, "o"));
+    line_say(&bench.line, "ab");
+    AWAIT(take_newest(&bench) && bench.counted.value == 'b');
+    assert_true(line_hears(&bench.line, "bs"));
+    assert_true(fl_serial_send(bench.serial, (const uint8_t *)"!", 1)); /* 100 ms of silence lie before it */
+    line_unplug(&bench.line);
+    AWAIT(!fl_serial_connected(bench.serial));
+    assert_false(fl_serial_send(bench.serial, (const uint8_t *)"!", 1));
+    assert_false(take_newest(&bench));
+    line_plug(&bench.line);
+    AWAIT(fl_serial_connected(bench.serial));
+    assert_true(line_hears(&bench.line, "o"));
+    line_say(&bench.line, "c");
+    AWAIT(take_newest(&bench));
+    assert_int_equal(bench.counted.value, 'c');
+    assert_int_equal(bench.counted.fed, 1); /* the parser began anew, */
+    assert_int_equal(bench.sequence, 3);    /* the sequence did not */
+    for (const char *until = "bs"; *until;) {
+        char heard;
+        assert_int_equal(read(bench.line.master, &heard, 1), 1);
+        assert_int_not_equal(heard, '!'); /* a stale command */
+        until += heard == *until;
+    }
+    bench_destroy(&bench);
+}
+
+static void sends_what_the_step_queues(void **state)
+{
+    (void)state;
+    struct bench bench = bench_create(&newest, "nothing");
+    assert_true(fl_serial_send(bench.serial, (const uint8_t *)"zero", 4));
+    assert_true(line_hears(&bench.line, "zero")); /* though the device is silent */
+    uint8_t large[65] = {0};
+    assert_false(fl_serial_send(bench.serial, large, sizeof large));
+    bench_destroy(&bench);
+}
+
+static void says_why_it_sends(void **state)
+{
+    (void)state;
+    struct bench bench = bench_create(&newest, "reason");
+    assert_true(line_hears(&bench.line, "os"));
+    line_say(&bench.line, "x");
+    assert_true(line_hears(&bench.line, "bs"));
+    assert_true(fl_serial_send(bench.serial, (const uint8_t *)"off", 3));
+    fl_serial_stop(bench.serial);
+    assert_true(line_hears(&bench.line, "off"));
+    assert_true(line_hears(&bench.line, "c"));
+    line_unplug(&bench.line);
+    testbed_end(bench.block);
+}
+
+/* A USB device that takes no byte any more must not keep its thread for ever, and its block from what it still sends.
+ */
+static void opens_a_stuck_port_anew(void **state)
+{
+    (void)state;
+    struct bench bench = bench_create(&newest, "loud");
+    unsigned opened = exclusions;
+    for (int64_t begun_ns = fl_now_ns(); exclusions == opened;) {
+        ssize_t ignored = write(bench.line.master, "x", 1);
+        (void)ignored;
+        if (!line_tick(begun_ns))
+            fail_msg("the port stayed stuck");
+    }
+    bench_destroy(&bench);
+}
+
+static void says_once_why_it_cannot_open(void **state)
+{
+    (void)state;
+    char said[4096] = "";
+    struct line line = line_create();
+    line_unplug(&line);
+    FILE *file = fopen(line.path, "w"), *log = tmpfile(); /* a file is no terminal */
+    assert_true(file && log);
+    fclose(file);
+    int error_output = dup(2);
+    dup2(fileno(log), 2);
+    struct fl_block *block = testbed_block("probe", "device", line.path, NULL);
+    const struct probe *probe = block->parameters;
+    unsigned attempts = exclusions;
+    struct fl_serial *serial = fl_serial_start(block, &newest, FL_SERIAL_SETTINGS(probe), probe);
+    AWAIT(exclusions >= attempts + 3);
+    assert_false(fl_serial_connected(serial));
+    unlink(line.path);
+    line_plug(&line);
+    AWAIT(fl_serial_connected(serial));
+    fl_serial_stop(serial);
+    dup2(error_output, 2);
+    close(error_output);
+    rewind(log);
+    size_t count = fread(said, 1, sizeof said - 1, log);
+    said[count] = '\0';
+    fclose(log);
+    const char *reason = strstr(said, "Inappropriate ioctl");
+    assert_non_null(reason);
+    assert_null(strstr(reason + 1, "Inappropriate ioctl"));
+    assert_non_null(strstr(said, "is open"));
+    line_unplug(&line);
+    testbed_end(block);
+}
+
+static void is_exclusive_while_open_only(void **state)
+{
+    (void)state;
+    struct line line = line_create();
+    int exclusive = -1, other = open(line.path, O_RDWR | O_NOCTTY); /* keeps the terminal alive */
+    assert_true(other >= 0);
+    struct fl_block *block = testbed_block("probe", "device", line.path, NULL);
+    const struct probe *probe = block->parameters;
+    struct fl_serial *serial = fl_serial_start(block, &newest, FL_SERIAL_SETTINGS(probe), probe);
+    AWAIT(fl_serial_connected(serial));
+    assert_int_equal(ioctl(other, TIOCGEXCL, &exclusive), 0);
+    assert_int_equal(exclusive, 1);
+    fl_serial_stop(serial);
+    assert_int_equal(ioctl(other, TIOCGEXCL, &exclusive), 0);
+    assert_int_equal(exclusive, 0);
+    close(other);
+    line_unplug(&line);
+    testbed_end(block);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(settings_reach_the_port),
+        cmocka_unit_test(refuses_a_rate_that_the_port_lacks),
+        cmocka_unit_test(newest_is_the_newest_however_slow_the_step),
+        cmocka_unit_test(each_in_turn_and_what_is_lost_is_seen),
+        cmocka_unit_test(comes_back_after_unplugging),
+        cmocka_unit_test(sends_what_the_step_queues),
+        cmocka_unit_test(says_why_it_sends),
+        cmocka_unit_test(opens_a_stuck_port_anew),
+        cmocka_unit_test(says_once_why_it_cannot_open),
+        cmocka_unit_test(is_exclusive_while_open_only),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}

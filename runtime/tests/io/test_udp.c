@@ -1,0 +1,382 @@
+#define _GNU_SOURCE
+#include "testbed.h"
+
+#include "blocks/io/udp.h"
+#include "executive/service.h"
+
+#include <arpa/inet.h>
+#include <math.h>
+#include <netinet/ip.h>
+#include <sched.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/socket.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+/* A bare socket on loopback: the other side of a block. */
+static int bare(const char *address, uint16_t port)
+{
+    struct sockaddr_in local = {.sin_family = AF_INET, .sin_port = htons(port)};
+    int fd = socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+    assert_int_equal(inet_pton(AF_INET, address, &local.sin_addr), 1);
+    assert_int_equal(bind(fd, (struct sockaddr *)&local, sizeof local), 0);
+    return fd;
+}
+
+static uint16_t port_of(int fd)
+{
+    struct sockaddr_in local;
+    socklen_t size = sizeof local;
+    assert_int_equal(getsockname(fd, (struct sockaddr *)&local, &size), 0);
+    return ntohs(local.sin_port);
+}
+
+static const char *free_port(void)
+{
+    static char text[8];
+    int fd = bare("0.0.0.0", 0);
+    snprintf(text, sizeof text, "%u", port_of(fd));
+    close(fd);
+    return text;
+}
+
+static void send_to(int fd, const char *port, const void *bytes, size_t count)
+{
+    struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons((uint16_t)atoi(port))};
+    to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    assert_int_equal(sendto(fd, bytes, count, 0, (struct sockaddr *)&to, sizeof to), count);
+}
+
+static void refuses_to_start(struct fl_block *block, const char *reason)
+{
+    assert_int_equal(block->type->start(block), FL_FAILED);
+    if (!strstr(block->service->failure, reason))
+        fail_msg("%s", block->service->failure);
+    testbed_end(block);
+}
+
+static int64_t arrival_ns(struct fl_block *block)
+{
+    return block->release_ns - llround(GET(block, "age", double) * 1e9);
+}
+
+/* The next step is due at `release_ns`. */
+static void step_at(struct fl_block *block, int64_t release_ns)
+{
+    block->release_ns = release_ns - block->period_ns;
+    assert_int_equal(testbed_step(block), FL_OK);
+}
+
+static void carries(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "3", NULL);
+    struct fl_block *send = testbed_block("udp-send", "address", "127.0.0.1", "port", port, "length", "3", NULL);
+    testbed_begin(receive);
+    testbed_begin(send);
+    testbed_step(receive);
+    assert_false(GET(receive, "flag", bool));
+    assert_int_equal(GET(receive, "sequence", uint32_t), 0);
+    for (uint8_t i = 1; i <= 3; i++) {
+        memcpy(testbed_input(send, "data"), (uint8_t[]){i, 0xff, 0}, 3);
+        testbed_step(send);
+        step_at(receive, fl_now_ns());
+        assert_true(GET(receive, "flag", bool));
+        assert_int_equal(GET(receive, "sequence", uint32_t), i);
+        assert_memory_equal(testbed_output(receive, "data"), ((uint8_t[]){i, 0xff, 0}), 3);
+    }
+    assert_int_equal(GET(send, "sent", uint32_t), 3);
+    assert_int_equal(GET(send, "failed", uint32_t), 0);
+    testbed_end(send);
+    testbed_end(receive);
+}
+
+static void takes(const char *how, uint8_t first, uint32_t sequence)
+{
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "1", "take", how, NULL);
+    int fd = bare("127.0.0.1", 0);
+    testbed_begin(receive);
+    for (uint8_t i = 1; i <= 3; i++)
+        send_to(fd, port, &i, 1);
+    testbed_step(receive);
+    assert_int_equal(*(const uint8_t *)testbed_output(receive, "data"), first);
+    assert_int_equal(GET(receive, "sequence", uint32_t), sequence);
+    testbed_step(receive);
+    testbed_step(receive);
+    testbed_step(receive);
+    assert_int_equal(*(const uint8_t *)testbed_output(receive, "data"), 3);
+    assert_int_equal(GET(receive, "sequence", uint32_t), 3);
+    close(fd);
+    testbed_end(receive);
+}
+
+static void takes_newest_or_in_order(void **state)
+{
+    (void)state;
+    takes("newest", 3, 3);
+    takes("in-order", 1, 1);
+}
+
+static void refuses_lengths_and_senders(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive =
+        testbed_block("udp-receive", "port", port, "length", "4", "from", "127.0.0.2", "take", "in-order", NULL);
+    int right = bare("127.0.0.2", 0), wrong = bare("127.0.0.3", 0);
+    testbed_begin(receive);
+    send_to(right, port, "abc", 3);
+    send_to(right, port, "abcde", 5);
+    send_to(right, port, "", 0);
+    send_to(wrong, port, "evil", 4);
+    testbed_step(receive);
+    assert_false(GET(receive, "flag", bool));
+    assert_int_equal(GET(receive, "sequence", uint32_t), 0);
+    assert_int_equal(GET(receive, "refused", uint32_t), 4);
+    send_to(right, port, "good", 4);
+    send_to(wrong, port, "evil", 4);
+    testbed_step(receive);
+    testbed_step(receive);
+    assert_true(GET(receive, "flag", bool));
+    assert_int_equal(GET(receive, "sequence", uint32_t), 1);
+    assert_int_equal(GET(receive, "refused", uint32_t), 5);
+    assert_memory_equal(testbed_output(receive, "data"), "good", 4);
+    close(right);
+    close(wrong);
+    testbed_end(receive);
+}
+
+static void ages_from_arrival(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "1", "timeout", "0.02", NULL);
+    int fd = bare("127.0.0.1", 0);
+    testbed_begin(receive);
+    int64_t before = fl_now_ns();
+    send_to(fd, port, "x", 1);
+    int64_t after = fl_now_ns();
+    while (fl_now_ns() < after + 3000000)
+        ; /* read late: the age counts from the kernel's stamp, not from the step */
+    step_at(receive, fl_now_ns());
+    int64_t arrived = arrival_ns(receive);
+    /* Two clocks that are read one after the other. */
+    assert_in_range(arrived, before - 1000000, after + 1000000);
+    step_at(receive, arrived + 20000000);
+    assert_true(GET(receive, "flag", bool));
+    assert_near(GET(receive, "age", double), 0.02, 1e-12);
+    step_at(receive, arrived + 20000001);
+    assert_false(GET(receive, "flag", bool));
+    step_at(receive, arrived - 1);
+    assert_true(GET(receive, "flag", bool));
+    assert_near(GET(receive, "age", double), 0, 0);
+    close(fd);
+    testbed_end(receive);
+}
+
+static void stamps_survive_a_set_clock(void **state)
+{
+    (void)state;
+    /* stamp, wall clock now, monotonic now, monotonic when last empty */
+    assert_int_equal(udp_arrival_ns(900, 1000, 50500, 50000), 50400);
+    assert_int_equal(udp_arrival_ns(900, 1000000000, 50500, 50000), 50000); /* set forward since */
+    assert_int_equal(udp_arrival_ns(900, 100, 50500, 50000), 50500);        /* set back since */
+    assert_int_equal(udp_arrival_ns(INT64_MAX, INT64_C(1800000000000000000), 50500, 50000), 50500); /* no stamp */
+}
+
+static void bounds_a_burst(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "1", NULL);
+    int fd = bare("127.0.0.1", 0);
+    testbed_begin(receive);
+    for (uint8_t i = 0; i < UDP_BURST + 10; i++)
+        send_to(fd, port, &i, 1);
+    testbed_step(receive);
+    assert_int_equal(GET(receive, "sequence", uint32_t), UDP_BURST);
+    testbed_step(receive);
+    assert_int_equal(GET(receive, "sequence", uint32_t), UDP_BURST + 10);
+    for (uint8_t i = 0; i < UDP_BURST + 10; i++)
+        send_to(fd, port, "no", 2);
+    testbed_step(receive);
+    assert_int_equal(GET(receive, "refused", uint32_t), UDP_BURST);
+    close(fd);
+    testbed_end(receive);
+}
+
+static void counts_drops(void **state)
+{
+    (void)state;
+    enum { FLOOD = 20000 };
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "1", NULL);
+    int fd = bare("127.0.0.1", 0);
+    testbed_begin(receive);
+    for (int i = 0; i < FLOOD; i++)
+        send_to(fd, port, "x", 1);
+    uint32_t before;
+    do {
+        before = GET(receive, "sequence", uint32_t);
+        testbed_step(receive);
+    } while (GET(receive, "sequence", uint32_t) != before);
+    assert_int_equal(GET(receive, "dropped", uint32_t), 0); /* the kernel tells with the next datagram */
+    send_to(fd, port, "x", 1);
+    testbed_step(receive);
+    assert_in_range(GET(receive, "dropped", uint32_t), 1, FLOOD);
+    assert_int_equal(GET(receive, "dropped", uint32_t) + GET(receive, "sequence", uint32_t), FLOOD + 1);
+    close(fd);
+    testbed_end(receive);
+}
+
+static void broadcasts_where_allowed(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "1", NULL);
+    struct fl_block *send = testbed_block("udp-send", "address", "127.255.255.255", "port", port, "length", "1",
+                                          "broadcast", "true", "interface", "lo", NULL);
+    testbed_begin(receive);
+    testbed_begin(send);
+    SET(send, "data", uint8_t, 7);
+    testbed_step(send);
+    testbed_step(receive);
+    assert_int_equal(GET(receive, "sequence", uint32_t), 1);
+    testbed_end(send);
+    testbed_end(receive);
+    send = testbed_block("udp-send", "address", "127.255.255.255", "port", port, "length", "1", NULL);
+    refuses_to_start(send, "127.255.255.255 is the broadcast address of a network; allow it by broadcast: true");
+    assert_non_null(strstr(testbed_refusal("udp-send", "address", "255.255.255.255", "port", port, "length", "1", NULL),
+                           "255.255.255.255 is a broadcast address; allow it by broadcast: true"));
+}
+
+static void marks_service(void **state)
+{
+    (void)state;
+    int fd = bare("127.0.0.1", 0), on = 1;
+    char port[8], control[64], byte;
+    struct iovec part = {&byte, 1};
+    struct msghdr message = {
+        .msg_iov = &part, .msg_iovlen = 1, .msg_control = control, .msg_controllen = sizeof control};
+    assert_int_equal(setsockopt(fd, IPPROTO_IP, IP_RECVTOS, &on, sizeof on), 0);
+    snprintf(port, sizeof port, "%u", port_of(fd));
+    struct fl_block *send = testbed_block("udp-send", "address", "127.0.0.1", "local_address", "127.0.0.9", "port",
+                                          port, "length", "1", "dscp", "46", NULL);
+    struct sockaddr_in sender;
+    message.msg_name = &sender;
+    message.msg_namelen = sizeof sender;
+    testbed_begin(send);
+    testbed_step(send);
+    assert_int_equal(recvmsg(fd, &message, MSG_DONTWAIT), 1);
+    struct cmsghdr *service = CMSG_FIRSTHDR(&message);
+    assert_non_null(service);
+    assert_int_equal(service->cmsg_type, IP_TOS);
+    assert_int_equal(*CMSG_DATA(service), 0xb8); /* RFC 3246: expedited forwarding */
+    assert_int_equal(ntohl(sender.sin_addr.s_addr), 0x7f000009);
+    close(fd);
+    testbed_end(send);
+}
+
+/* In a network name space of its own, where even loopback is down. */
+static void counts_what_no_network_takes(void **state)
+{
+    (void)state;
+    struct fl_block *send = testbed_block("udp-send", "address", "192.0.2.1", "port", "5000", "length", "1", NULL);
+    int status;
+    pid_t child = fork();
+    if (child == 0) {
+        if (unshare(CLONE_NEWNET) < 0 && unshare(CLONE_NEWUSER | CLONE_NEWNET) < 0)
+            _exit(77);
+        if (send->type->start(send) != FL_OK)
+            _exit(1);
+        bool right = testbed_step(send) == FL_OK && testbed_step(send) == FL_OK && GET(send, "failed", uint32_t) == 2 &&
+                     GET(send, "sent", uint32_t) == 0;
+        _exit(right ? 0 : 2);
+    }
+    assert_int_equal(waitpid(child, &status, 0), child);
+    testbed_end(send);
+    if (WEXITSTATUS(status) == 77)
+        skip();
+    assert_int_equal(status, 0);
+}
+
+static const char *said_of_send(const char *address, const char *local_address)
+{
+    return testbed_refusal("udp-send", "port", "5000", "length", "1", "address", address, "local_address",
+                           local_address, NULL);
+}
+
+static const char *said_of_receive(const char *local_address, const char *from)
+{
+    return testbed_refusal("udp-receive", "port", "5000", "length", "1", "local_address", local_address, "from", from,
+                           NULL);
+}
+
+static void refuses(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *type, *name, *value, *reason;
+    } bad[] = {
+        {"udp-send", "dscp", "64", "parameter dscp: 64 is outside 0 to 63"},
+        {"udp-send", "port", "0", "parameter port: 0 is outside 1 to 65535"},
+        {"udp-send", "length", "1473", "parameter length: 1473 is outside 1 to 1472 B"},
+        {"udp-receive", "port", "65536", "parameter port: 65536 is outside 1 to 65535"},
+        {"udp-receive", "length", "0", "parameter length: 0 is outside 1 to 1472 B"},
+        {"udp-receive", "take", "oldest", "oldest is none of newest|in-order"},
+        {"udp-receive", "timeout", "-1", "parameter timeout: -1 is outside 0.001 to 3600 s"},
+    };
+    for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
+        const char *said = testbed_refusal(bad[i].type, bad[i].name, bad[i].value, NULL);
+        if (!strstr(said, bad[i].reason))
+            fail_msg("%s: %s", bad[i].reason, said);
+    }
+    assert_non_null(strstr(said_of_send("224.0.0.1", "0.0.0.0"), "224.0.0.1 is a multicast group"));
+    assert_non_null(strstr(said_of_send("robot3", "0.0.0.0"), "address: robot3 is not an IPv4 address such as"));
+    assert_non_null(strstr(said_of_send("0.0.0.0", "0.0.0.0"), "0.0.0.0 is nowhere to send to"));
+    assert_non_null(strstr(said_of_send("127.0.0.1", "::1"), "local_address: ::1 is not an IPv4 address"));
+    assert_non_null(strstr(said_of_receive("0.0.0.0", "10.0.0"), "from: 10.0.0 is not an IPv4 address"));
+    assert_non_null(strstr(said_of_receive("239.1.2.3", "0.0.0.0"), "239.1.2.3 is a multicast group"));
+}
+
+static void refuses_to_start_without(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    refuses_to_start(testbed_block("udp-receive", "port", port, "length", "1", "interface", "nosuch0", NULL),
+                     "there is no network interface nosuch0");
+    refuses_to_start(
+        testbed_block("udp-receive", "port", port, "length", "1", "interface", "a-name-that-is-too-long", NULL),
+        "there is no network interface a-name-that-is-too-long");
+    refuses_to_start(testbed_block("udp-receive", "port", port, "length", "1", "local_address", "192.0.2.1", NULL),
+                     "192.0.2.1 is no address of this computer");
+    struct fl_block *first = testbed_block("udp-receive", "port", port, "length", "1", NULL);
+    testbed_begin(first);
+    refuses_to_start(testbed_block("udp-receive", "port", port, "length", "1", NULL), "another block or program");
+    testbed_end(first);
+    first = testbed_block("udp-receive", "port", port, "length", "1", NULL); /* the port is free again */
+    testbed_begin(first);
+    testbed_end(first);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(carries),
+        cmocka_unit_test(takes_newest_or_in_order),
+        cmocka_unit_test(refuses_lengths_and_senders),
+        cmocka_unit_test(ages_from_arrival),
+        cmocka_unit_test(stamps_survive_a_set_clock),
+        cmocka_unit_test(bounds_a_burst),
+        cmocka_unit_test(counts_drops),
+        cmocka_unit_test(broadcasts_where_allowed),
+        cmocka_unit_test(marks_service),
+        cmocka_unit_test(counts_what_no_network_takes),
+        cmocka_unit_test(refuses),
+        cmocka_unit_test(refuses_to_start_without),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}

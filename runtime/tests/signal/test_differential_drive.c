@@ -1,0 +1,116 @@
+#include "testbed.h"
+
+#include <math.h>
+
+static const double pi = 3.14159265358979323846;
+
+static void drive(struct fl_block *block, double v, double omega)
+{
+    SET(block, "v", double, v);
+    SET(block, "omega", double, omega);
+    assert_int_equal(testbed_step(block), FL_OK);
+}
+
+static void turns_the_wheels(void **state)
+{
+    (void)state;
+    struct fl_block *block = testbed_block("differential-drive", "radius", "0.1", "track", "0.4", NULL);
+    testbed_begin(block);
+    drive(block, 0.5, 0);
+    assert_near(GET(block, "left", double), 5, 1e-12);
+    assert_near(GET(block, "right", double), 5, 1e-12);
+    drive(block, 0, 1); /* anticlockwise: the right wheel ahead */
+    assert_near(GET(block, "left", double), -2, 1e-12);
+    assert_near(GET(block, "right", double), 2, 1e-12);
+    assert_false(GET(block, "limited", uint8_t));
+    drive(block, NAN, 1);
+    assert_near(GET(block, "left", double), 0, 0);
+    assert_near(GET(block, "right", double), 0, 0);
+    assert_true(GET(block, "limited", uint8_t));
+    testbed_end(block);
+}
+
+/* v / omega, the radius of the curve, stays. */
+static void slows_down_on_the_curve(void **state)
+{
+    (void)state;
+    struct fl_block *block = testbed_block("differential-drive", "radius", "0.1", "track", "0.4", "fastest", "8", NULL);
+    testbed_begin(block);
+    drive(block, 1.2, 2); /* 8 and 16 rad/s */
+    assert_near(GET(block, "left", double), 4, 1e-12);
+    assert_near(GET(block, "right", double), 8, 1e-12);
+    assert_true(GET(block, "limited", uint8_t));
+    drive(block, -1.2, 0);
+    assert_near(GET(block, "left", double), -8, 1e-12);
+    testbed_end(block);
+}
+
+static void roll(struct fl_block *odometry, double left, double right, int steps)
+{
+    SET(odometry, "left", double, left);
+    SET(odometry, "right", double, right);
+    for (int i = 0; i < steps; i++)
+        assert_int_equal(testbed_step(odometry), FL_OK);
+}
+
+/* Wheels of 2 and 4 rad/s, radius 0.1 m, track 0.4 m: 0.3 m/s and 0.5 rad/s, a circle of 0.6 m. */
+static void drives_a_circle(void **state)
+{
+    (void)state;
+    struct fl_block *odometry = testbed_block("differential-odometry", "radius", "0.1", "track", "0.4", NULL);
+    struct fl_block *other = testbed_block("differential-odometry", "radius", "0.1", "track", "0.4", "x", "1", "y", "2",
+                                           "heading", "1.5707963267948966", NULL);
+    testbed_begin(odometry);
+    testbed_begin(other);
+    for (int i = 1; i <= 1500; i++) {
+        double angle = 0.5 * 0.01 * i;
+        roll(odometry, 2, 4, 1);
+        assert_near(GET(odometry, "x", double), 0.6 * sin(angle), 1e-9);
+        assert_near(GET(odometry, "y", double), 0.6 * (1 - cos(angle)), 1e-9);
+        assert_near(GET(odometry, "heading", double), angle, 1e-9);
+    }
+    assert_near(GET(odometry, "v", double), 0.3, 1e-12);
+    assert_near(GET(odometry, "omega", double), 0.5, 1e-12);
+    assert_near(GET(other, "x", double), 1, 0);
+    roll(other, 10, 10, 100); /* straight on, along y */
+    assert_near(GET(other, "x", double), 1, 1e-9);
+    assert_near(GET(other, "y", double), 3, 1e-9);
+    assert_near(GET(other, "heading", double), pi / 2, 0);
+    testbed_end(odometry);
+    testbed_end(other);
+}
+
+static void keeps_its_pose(void **state)
+{
+    (void)state;
+    struct fl_block *odometry = testbed_block("differential-odometry", "radius", "0.1", "track", "0.4", "x", "1", NULL);
+    testbed_begin(odometry);
+    roll(odometry, 10, 10, 100);
+    roll(odometry, NAN, 10, 5);
+    assert_near(GET(odometry, "v", double), 0, 0);
+    assert_near(GET(odometry, "x", double), 2, 1e-9);
+    SET(odometry, "reset", uint8_t, 1);
+    roll(odometry, 10, 10, 3);
+    assert_near(GET(odometry, "x", double), 1, 0);
+    SET(odometry, "reset", uint8_t, 0);
+    roll(odometry, 10, 10, 1);
+    assert_near(GET(odometry, "x", double), 1.01, 1e-12);
+    testbed_end(odometry);
+}
+
+static void refuses(void **state)
+{
+    (void)state;
+    assert_non_null(strstr(testbed_refusal("differential-drive", "radius", "0", "track", "1", NULL), "0 is outside"));
+    assert_non_null(strstr(testbed_refusal("differential-odometry", "radius", "1", NULL), "parameter track of"));
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(turns_the_wheels), cmocka_unit_test(slows_down_on_the_curve),
+        cmocka_unit_test(drives_a_circle),  cmocka_unit_test(keeps_its_pose),
+        cmocka_unit_test(refuses),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
