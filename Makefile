@@ -55,6 +55,7 @@ check: | setup-tests ## lint, types and unit tests, under a minute
 	$(Q)$(VENV)/bin/mypy
 	$(Q)$(call shell_scripts) | xargs shellcheck
 	$(Q)PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/ansible-lint --offline -q ansible
+	$(Q)$(MAKE) check-runtime
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 
 test: | setup-tests ## everything: checks, images, boots in QEMU
@@ -65,6 +66,22 @@ test: | setup-tests ## everything: checks, images, boots in QEMU
 
 bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
+
+##@ Runtime
+.PHONY: runtime check-runtime
+meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
+# What a compiler says matters when it fails.
+compile = $(meson) compile -C $1 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
+runtime: | setup-tests ## the runtime's programs for this computer, in build/runtime
+	$(Q)test -f $(BUILD)/runtime/build.ninja || $(meson) setup $(BUILD)/runtime runtime >/dev/null
+	$(Q)$(call compile,$(BUILD)/runtime)
+
+check-runtime: | setup-tests ## the runtime's unit tests, with AddressSanitizer and UBSan
+	$(Q)git ls-files 'runtime/*.[ch]' | xargs $(VENV)/bin/clang-format --dry-run -Werror
+	$(Q)test -f $(BUILD)/runtime-sanitized/build.ninja || $(meson) setup $(BUILD)/runtime-sanitized runtime -Dtests=true \
+	    -Db_sanitize=address,undefined -Dbuildtype=debugoptimized >/dev/null
+	$(Q)$(call compile,$(BUILD)/runtime-sanitized)
+	$(Q)$(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck
@@ -93,7 +110,8 @@ setup-tests: setup ## install what testing needs
 
 $(VENV)/.complete: requirements.lock images/host-packages.txt
 	$(Q)images/install-host-packages images/host-packages.txt
-	$(Q)python3 -m venv --clear $(VENV)
+	$(Q)rm -rf $(VENV)
+	$(Q)python3 -m venv $(VENV)
 	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r requirements.lock
 	$(Q)touch $@
 

@@ -17,6 +17,7 @@ Check as much as possible on a shared guest: each boot costs half a minute. Leav
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -69,6 +70,14 @@ GuestFactory = Callable[..., RobotGuest]
 def fleet() -> Fleet:
     """The fleet that `ansible/inventory/` describes."""
     return inventory.load_fleet()
+
+
+@pytest.fixture(scope="session")
+def flotilla_run() -> Path:
+    """The runtime's program, built for this computer; flotilla-blocks lies beside it."""
+    done = subprocess.run(["make", "-C", str(paths.PROJECT), "runtime"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return paths.BUILD / "runtime" / "flotilla-run"
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,351 @@
+"""The executive on this computer: tasks that are wrong, blocks that misbehave, ends of every kind.
+
+`runtime/tests/plugin/misbehave.c` is what misbehaves; it is built here as a stranger would build a plug-in.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from images.builder import paths
+
+PLUGIN = paths.PROJECT / "runtime" / "tests" / "plugin"
+HEADERS = paths.PROJECT / "runtime" / "include"
+
+
+@pytest.fixture(scope="module")
+def plugins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the misbehaving plug-in."""
+    directory = tmp_path_factory.mktemp("blocks")
+    compile_shared(PLUGIN / "misbehave.c", directory / "misbehave.so", f"-I{HEADERS}")
+    return directory
+
+
+def compile_shared(source: Path, out: Path, *options: str) -> None:
+    command = ["cc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "-O1", *options]
+    subprocess.run([*command, "-o", str(out), str(source)], check=True)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A run of flotilla-run that ended."""
+
+    status: int
+    err: str
+    rows: list[dict[str, Any]]
+    statistics: dict[str, Any]
+
+
+class Tasks:
+    """Runs tasks."""
+
+    def __init__(self, program: Path, plugins: Path, directory: Path) -> None:
+        self.program, self.plugins, self.directory = program, plugins, directory
+
+    def write(self, text: str) -> Path:
+        file = self.directory / "task.yml"
+        file.write_text(text)
+        return file
+
+    def argv(self, text: str, *options: str) -> list[str]:
+        return [str(self.program), "--blocks", str(self.plugins), *options, str(self.write(text))]
+
+    def run(self, text: str, *options: str, environment: dict[str, str] | None = None) -> Ended:
+        """Run to its end, within a minute."""
+        statistics = self.directory / "statistics.json"
+        argv = self.argv(text, "--statistics", str(statistics), *options)
+        done = subprocess.run(argv, capture_output=True, text=True, timeout=60, env=environment, check=False)
+        rows = [json.loads(line) for line in done.stdout.splitlines()] if "--watch" in options else []
+        return Ended(
+            done.returncode, done.stderr, rows, json.loads(statistics.read_text()) if statistics.exists() else {}
+        )
+
+    def refusal(self, text: str) -> list[str]:
+        """What `--check` says, line by line, without the file's name."""
+        done = subprocess.run(self.argv(text, "--check"), capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 2, done.stderr
+        return [line.replace(f"{self.directory}/task.yml:", "") for line in done.stderr.splitlines()]
+
+
+@pytest.fixture
+def tasks(flotilla_run: Path, plugins: Path, tmp_path: Path) -> Tasks:
+    return Tasks(flotilla_run, plugins, tmp_path)
+
+
+def task(blocks: str, head: str = "period: 1 ms") -> str:
+    return f"{head}\nblocks:\n" + "".join(f"  {line}\n" for line in blocks.strip().splitlines())
+
+
+REFUSED = {
+    "no YAML": ("period: [", "1: "),
+    "empty": ("", "it is empty"),
+    "no period": ("blocks:\n  a: {type: gain, in: {in: 1}}", "task: period is missing: the time between two steps"),
+    "period 0": (task("a: {type: gain, in: {in: 1}}", "period: 0 ms"), "1: period: 0 ms is not from 50 us"),
+    "period without unit": (task("a: {type: gain, in: {in: 1}}", "period: 10"), "10 is not a time such as 10 ms"),
+    "period twice": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\nperiod: 2 ms"), "2: task: period is there"),
+    "unknown key": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\nrate: 1"), "2: task: unknown key rate; there"),
+    "priority": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 99"), "2: priority: 99 is not a whole"),
+    "priority 1": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 1"), "priority: 1 leaves none below"),
+    "policy": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\noverrun: ignore"), "2: overrun: ignore is none of"),
+    "no blocks": ("period: 1 ms\nblocks: {}", "2: blocks: there is none"),
+    "no type": (task("a: {in: {in: 1}}"), "3: block a: type is missing"),
+    "unknown block": (task("a: {type: gian, in: {in: 1}}"), "3: block a: there is no block gian, the nearest is gain;"),
+    "block's name": (task("a.b: {type: gain, in: {in: 1}}"), "3: block a.b: a name begins with a letter"),
+    "every 0": (task("a: {type: gain, every: 0, in: {in: 1}}"), "3: every: 0 is not a whole number from 1"),
+    "offset": (task("a: {type: gain, every: 2, offset: 2, in: {in: 1}}"), "3: block a: offset 2 is not below every 2"),
+    "unknown parameter": (
+        task("a: {type: gain, in: {in: 1}, parameters: {faktor: 2}}"),
+        "3: block a: gain has no parameter faktor; it has",
+    ),
+    "value": (task("a: {type: gain, in: {in: 1}, parameters: {factor: two}}"), "parameter factor: two is not a number"),
+    "list": (
+        task("a: {type: gain, in: {in: 1}, parameters: {factor: [1]}}"),
+        "the list beginning with 1 is not a number",
+    ),
+    "mapping": (task("a: {type: gain, in: {in: 1}, parameters: {factor: {b: 1}}}"), "factor is a mapping, not a value"),
+    "missing parameter": (task("a: {type: trace}"), "3: block a: parameter device of trace is missing"),
+    "relative device": (task("a: {type: trace, parameters: {device: gyro}}"), "gyro is not a device's path"),
+    "choice": (task("a: {type: misbehave, parameters: {manner: sulk}}"), "sulk is none of fail|hang|late|allocate"),
+    "no wire": (task("a: {type: gain}"), "3: block a: input in has no wire: any signal"),
+    "unknown input": (task("a: {type: gain, in: {in: 1, on: 2}}"), "3: block a: gain has no input on; it has in"),
+    "unknown source": (
+        task("a: {type: gain, in: {in: b.out}}"),
+        "3: block a: input in: b.out: the task has no block b",
+    ),
+    "unknown output": (task("a: {type: gain, in: {in: a.aut}}"), "a.aut: gain has no output aut; it has out"),
+    "no port": (task("a: {type: gain, in: {in: b}}"), "b is neither a wire (block.port) nor a number"),
+    "element": (
+        task("a: {type: gain, in: {in: 'b.out[1]'}}\nb: {type: gain, in: {in: 1}}"),
+        "its elements are [0] to [0]",
+    ),
+    "wrong type": (
+        task("a: {type: gain, in: {in: b.steps}}\nb: {type: clock}"),
+        "input in takes double[1], b.steps is uint64[1]",
+    ),
+    "wrong width": (
+        task("a: {type: gain, in: {in: b.out}}\nb: {type: constant, parameters: {value: [1, 2]}}"),
+        "input in takes double[1], b.out is double[2]",
+    ),
+    "too many constants": (task("a: {type: gain, in: {in: [1, 2]}}"), "input in has 1 elements, not 2"),
+    "cycle": (
+        task("a: {type: gain, in: {in: b.out}}\nb: {type: gain, in: {in: a.out}}"),
+        "3: cycle without delay: a → b → a; put a block delay into one of its wires",
+    ),
+    "a device twice": (
+        task("a: {type: trace, parameters: {device: /dev/x}}\nb: {type: trace, parameters: {device: /dev/x}}"),
+        "4: block b: /dev/x is block a's; a device serves one block",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "said"), REFUSED.values(), ids=REFUSED.keys())
+def test_a_wrong_task_is_refused_with_file_line_and_remedy(tasks: Tasks, text: str, said: str) -> None:
+    (line,) = tasks.refusal(text)
+    assert said in line
+
+
+def test_all_errors_at_once(tasks: Tasks) -> None:
+    text = task("a: {type: gain}\nb: {type: gain, in: {in: x.y}, parameters: {factor: z}}", "period: 1 ms\npriority: x")
+    assert len(tasks.refusal(text)) == 4
+
+
+def test_signals_follow_the_wires_at_their_rates(tasks: Tasks) -> None:
+    text = task(
+        """
+last: {type: gain, in: {in: slow.out}}
+slow: {type: gain, every: 3, offset: 1, in: {in: ramp.out}}
+ramp: {type: sum, in: {in1: before.out, in2: 1}, parameters: {signs: "++"}}
+before: {type: delay, in: {in: ramp.out}}
+"""
+    )
+    ended = tasks.run(text, "--steps", "8", "--no-wait", "--watch", "ramp.out,last.out,slow.out")
+    assert ended.status == 0, ended.err
+    assert [row["ramp.out"] for row in ended.rows] == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert [row["slow.out"] for row in ended.rows] == [0, 2, 2, 2, 5, 5, 5, 8]
+    assert [row["last.out"] for row in ended.rows] == [row["slow.out"] for row in ended.rows]
+    releases = [row["release_ns"] for row in ended.rows]
+    assert {after - before for before, after in itertools.pairwise(releases)} == {1_000_000}
+
+
+def test_steps_are_counted_and_timed(tasks: Tasks) -> None:
+    ended = tasks.run(
+        task("a: {type: gain, in: {in: 1}}\nb: {type: gain, every: 4, in: {in: a.out}}"), "--steps", "100"
+    )
+    assert ended.status == 0, ended.err
+    counted = ended.statistics
+    assert counted["steps"] == 100 == counted["step"]["count"] == counted["jitter"]["count"]
+    assert (counted["blocks"]["a"]["count"], counted["blocks"]["b"]["count"]) == (100, 25)
+    assert 0 <= counted["step"]["min_ns"] <= counted["step"]["mean_ns"] <= counted["step"]["max_ns"]
+
+
+TRACE = "out: {{type: trace, parameters: {{device: {file}}}}}\n"
+
+
+@dataclass(frozen=True)
+class Bad:
+    """A manner of misbehaviour and what must follow."""
+
+    manner: str
+    head: str
+    said: str
+
+
+BAD = [
+    Bad("manner: fail, from: 3", "period: 1 ms", "bad: failed as asked in step 3"),
+    Bad("manner: start-fail", "period: 1 ms", "bad: the device is on fire"),
+    Bad("manner: hang, from: 3", "period: 1 ms", "no step for ten periods and a second, after step 3"),
+    Bad("manner: late, from: 3", "period: 10 ms\noverrun: stop-safe", "us after the next was due, 1 in a row"),
+    Bad("manner: late, from: 3", "period: 10 ms\noverruns: 4", "us after the next was due, 4 in a row"),
+    Bad("manner: late, from: 3", "period: 10 ms\noverrun: catch-up\noverruns: 4", "4 in a row"),
+]
+
+
+@pytest.mark.parametrize("bad", BAD, ids=lambda bad: f"{bad.manner}, {bad.head}".replace("\n", ", "))
+def test_what_a_block_does_wrong_ends_with_outputs_reset(tasks: Tasks, tmp_path: Path, bad: Bad) -> None:
+    """Seen to fail without the call of `safe` after the loop, and the hang without the supervision's time limit."""
+    device = tmp_path / "device"
+    text = task(TRACE.format(file=device) + f"bad: {{type: misbehave, parameters: {{{bad.manner}}}}}", bad.head)
+    ended = tasks.run(text)
+    assert ended.status == 1
+    assert bad.said in ended.err
+    assert "outputs are in their reset state" in ended.err
+    words = device.read_text().split()
+    assert words.count("on") == (0 if "start" in bad.manner else words.index("safe"))
+    assert words[-1] == ("safe" if "hang" in bad.manner else "terminated")
+
+
+def test_overruns_are_left_out_or_caught_up_with(tasks: Tasks) -> None:
+    late = "bad: {type: misbehave, parameters: {manner: late, from: 3, until: 5, late_s: 0.035}}"
+    skipping = tasks.run(task(late, "period: 10 ms"), "--steps", "30").statistics
+    assert skipping["overruns"] >= 2
+    assert skipping["skipped"] >= 6
+    catching_up = tasks.run(task(late, "period: 10 ms\noverrun: catch-up\noverruns: 0"), "--steps", "30").statistics
+    assert catching_up["overruns"] >= 6
+    assert catching_up["skipped"] == 0
+
+
+@pytest.fixture
+def running(tasks: Tasks, tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+    """Start a task and wait for its first step."""
+    started = []
+
+    def start(text: str) -> subprocess.Popen[str]:
+        argv = tasks.argv(text, "--watch", "a.out")
+        process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        started.append(process)
+        assert process.stdout
+        assert process.stdout.readline(), process.stderr and process.stderr.read()
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_with_outputs_reset(
+    running: Callable[[str], subprocess.Popen[str]], tmp_path: Path, number: signal.Signals
+) -> None:
+    device = tmp_path / "device"
+    process = running(task(TRACE.format(file=device) + "a: {type: gain, in: {in: 1}}"))
+    process.send_signal(number)
+    process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert device.read_text().split()[-2:] == ["safe", "terminated"]
+
+
+def test_a_second_start_is_refused_and_a_killed_one_leaves_no_lock(
+    tasks: Tasks, running: Callable[[str], subprocess.Popen[str]]
+) -> None:
+    text = task("a: {type: gain, in: {in: 1}}")
+    first = running(text)
+    again = tasks.run(text, "--steps", "1")
+    assert again.status == 3
+    assert f"runs already, as process {first.pid}; end that first" in again.err
+    first.kill()
+    first.wait()
+    assert tasks.run(text, "--steps", "1").status == 0
+
+
+def test_outputs_are_reset_after_a_task_was_killed(
+    tasks: Tasks, running: Callable[[str], subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    device = tmp_path / "device"
+    text = task(TRACE.format(file=device) + "a: {type: gain, in: {in: 1}}")
+    process = running(text)
+    process.kill()
+    process.wait()
+    assert device.read_text().split()[-1] == "on"
+    assert tasks.run(text, "--safe").status == 0
+    assert device.read_text().split()[-2:] == ["safe", "terminated"]
+
+
+def test_steps_allocate_nothing(tasks: Tasks, tmp_path: Path) -> None:
+    """Seen to fail: with the plug-in's block that allocates, below."""
+    preload = tmp_path / "no_allocation.so"
+    compile_shared(PLUGIN / "no_allocation.c", preload)
+    environment = {"LD_PRELOAD": str(preload), "NO_ALLOCATION_IN": "task"}
+    good = task(
+        "clock: {type: clock}\na: {type: gain, in: {in: 1}}\nb: {type: pid, in: {setpoint: 1, measured: a.out}}"
+    )
+    ended = tasks.run(good, "--steps", "20", "--watch", "a.out,b.out", environment=environment)
+    assert (ended.status, len(ended.rows)) == (0, 20), ended.err
+    bad = tasks.run(task("a: {type: misbehave, parameters: {manner: allocate}}"), environment=environment)
+    assert bad.status == 99
+    assert "allocation in a control step" in bad.err
+
+
+def test_a_plugin_of_another_interface_is_refused(tasks: Tasks, tmp_path: Path) -> None:
+    compile_shared(PLUGIN / "misbehave.c", tmp_path / "old.so", f"-I{HEADERS}", "-DMISBEHAVE_ABI=999")
+    older = Tasks(tasks.program, tmp_path, tmp_path)
+    lines = older.refusal(task("a: {type: misbehave, parameters: {manner: fail}}"))
+    assert "made for interface 999 of blocks, this is 1; build it anew" in lines[0]
+    assert "there is no block misbehave" in lines[-1]
+
+
+def test_the_graph_names_blocks_and_wires(tasks: Tasks) -> None:
+    text = task("a: {type: gain, every: 2, in: {in: 1}}\nb: {type: gain, in: {in: a.out}}")
+    drawn = subprocess.run(tasks.argv(text, "--dot"), capture_output=True, text=True, check=True).stdout
+    assert '"a" -> "b" [label="out → in"]' in drawn
+    assert "every 2" in drawn
+
+
+def test_privileges_that_are_missing_are_named(tasks: Tasks) -> None:
+    text = task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 50")
+    argv = [
+        "setpriv",
+        "--inh-caps=-all",
+        "--ambient-caps=-all",
+        "--bounding-set=-all",
+        "--reuid=65534",
+        "--clear-groups",
+    ]
+    done = subprocess.run(
+        ["prlimit", "--rtprio=0", "--memlock=0", *argv, *tasks.argv(text, "--steps", "3")],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "SCHED_FIFO 50 is refused" in done.stderr
+    assert "CAP_SYS_NICE or LimitRTPRIO=" in done.stderr
+    assert "memory cannot be locked" in done.stderr
+
+
+def test_blocks_are_listed_with_ports_units_and_source(flotilla_run: Path) -> None:
+    program = str(flotilla_run.with_name("flotilla-blocks"))
+    listed = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    assert "\ngain " in listed
+    detailed = subprocess.run([program, "gain"], capture_output=True, text=True, check=True).stdout
+    assert "default 1; tunable" in detailed
+    wrong = subprocess.run([program, "gian"], capture_output=True, text=True, check=False)
+    assert wrong.returncode == 2
+    assert "the nearest is gain" in wrong.stderr
