@@ -99,7 +99,7 @@ static const char *kept(struct fl_block *block, const char *text)
 }
 
 static bool read_reals(struct fl_block *block, const struct fl_parameter *parameter, const struct written *value,
-                       struct fl_reals *reals, bool *out_of_range)
+                       struct fl_reals *reals, const char **outside)
 {
     double *numbers = fl_allocate(block, sizeof(double) * (value->count + 1));
     if (!numbers)
@@ -107,8 +107,8 @@ static bool read_reals(struct fl_block *block, const struct fl_parameter *parame
     for (size_t i = 0; i < value->count; i++) {
         if (!read_real(value->text[i], &numbers[i]))
             return false;
-        if (!in_range(parameter, numbers[i]))
-            *out_of_range = true;
+        if (!in_range(parameter, numbers[i]) && !*outside)
+            *outside = value->text[i];
     }
     *reals = (struct fl_reals){value->count, numbers};
     return true;
@@ -126,9 +126,9 @@ static bool read_texts(struct fl_block *block, const struct written *value, stru
     return true;
 }
 
-/* Into a place of the kind's C type. */
+/* Into a place of the kind's C type. `outside` is set to the first number out of range. */
 static bool read_kind(struct fl_block *block, const struct fl_parameter *parameter, const struct written *value,
-                      void *place, bool *out_of_range)
+                      void *place, const char **outside)
 {
     const char *text = value->count ? value->text[0] : "";
     if (value->list && parameter->kind != FL_KIND_REALS && parameter->kind != FL_KIND_TEXTS)
@@ -139,12 +139,14 @@ static bool read_kind(struct fl_block *block, const struct fl_parameter *paramet
     case FL_KIND_INTEGER:
         if (!read_integer(text, place))
             return false;
-        *out_of_range = !in_range(parameter, (double)*(int64_t *)place);
+        if (!in_range(parameter, (double)*(int64_t *)place))
+            *outside = text;
         return true;
     case FL_KIND_REAL:
         if (!read_real(text, place))
             return false;
-        *out_of_range = !in_range(parameter, *(double *)place);
+        if (!in_range(parameter, *(double *)place))
+            *outside = text;
         return true;
     case FL_KIND_TEXT:
         return (*(const char **)place = kept(block, text)) != NULL;
@@ -153,7 +155,7 @@ static bool read_kind(struct fl_block *block, const struct fl_parameter *paramet
     case FL_KIND_CHOICE:
         return (*(int *)place = choice_named(parameter->choices, text)) >= 0;
     case FL_KIND_REALS:
-        return read_reals(block, parameter, value, place, out_of_range);
+        return read_reals(block, parameter, value, place, outside);
     case FL_KIND_TEXTS:
         return read_texts(block, value, place);
     }
@@ -186,9 +188,9 @@ bool parameter_set(struct fl_block *block, const struct fl_parameter *parameter,
         int choice;
         const char *text;
     } place = {.integer = 0};
-    bool out_of_range = false;
+    const char *outside = NULL;
     const char *text = value->count ? value->text[0] : "";
-    if (!read_kind(block, parameter, value, &place, &out_of_range)) {
+    if (!read_kind(block, parameter, value, &place, &outside)) {
         const char *unit = parameter->unit && *parameter->unit ? parameter->unit : NULL;
         if (parameter->kind == FL_KIND_CHOICE)
             snprintf(reason, reason_size, "%s is none of %s", text, parameter->choices);
@@ -197,8 +199,8 @@ bool parameter_set(struct fl_block *block, const struct fl_parameter *parameter,
                      *text ? text : "nothing", kind_names[parameter->kind], unit ? " in " : "", unit ? unit : "");
         return false;
     }
-    if (out_of_range) {
-        snprintf(reason, reason_size, "%s is outside %g to %g%s%s", text, parameter->min, parameter->max,
+    if (outside) {
+        snprintf(reason, reason_size, "%s is outside %g to %g%s%s", outside, parameter->min, parameter->max,
                  parameter->unit ? " " : "", parameter->unit ? parameter->unit : "");
         return false;
     }

@@ -2,7 +2,7 @@
 
 #include "text.h"
 
-enum state { WAITING, TEXT, HIGH, LOW }; /* WAITING is 0: a zeroed record is ready */
+enum state { WAITING, TEXT, HIGH, LOW, END }; /* WAITING is 0: a zeroed record is ready */
 
 bool record_feed(struct record *record, uint8_t byte, char end)
 {
@@ -27,13 +27,16 @@ bool record_feed(struct record *record, uint8_t byte, char end)
         }
         return false;
     case HIGH:
-        record->claimed = (uint8_t)(digit << 4);
+        record->claimed = (uint8_t)((unsigned)digit << 4);
         record->state = digit < 0 ? WAITING : LOW;
         return false;
     case LOW:
         record->claimed |= (uint8_t)digit;
+        record->state = digit < 0 ? WAITING : END;
+        return false;
+    case END: /* else a flipped bit that makes an end character would need only the two after it to fit */
         record->state = WAITING;
-        return digit >= 0;
+        return byte == '\r' || byte == '\n';
     }
     return false;
 }

@@ -1,5 +1,5 @@
-/* Text records on a serial line: a start character, printable text, an end character, and two hexadecimal digits that
- * are the exclusive or of the text. NMEA 0183 has $...*HH, OceanServer $...%HH. */
+/* Text records on a serial line: $, printable text, an end character, two hexadecimal digits that are the exclusive or
+ * of the text, CR or LF. NMEA 0183's end character is *, OceanServer's %. */
 #ifndef FLOTILLA_SERIAL_RECORD_H
 #define FLOTILLA_SERIAL_RECORD_H
 

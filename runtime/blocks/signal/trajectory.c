@@ -166,7 +166,7 @@ static void be_between(struct fl_block *block, size_t from, double time)
     const struct state *state = block->state;
     size_t dimensions = (size_t)trajectory->dimensions;
     const double *a = trajectory->waypoints.value + from * dimensions, *b = a + dimensions;
-    double duration = state->times[from + 1] - state->times[from], s[3];
+    double duration = state->times[from + 1] - state->times[from], s[3] = {0};
     double *position = block->out[POSITION], *velocity = block->out[VELOCITY], *acceleration = block->out[ACCELERATION];
     interpolate(trajectory->interpolation, (time - state->times[from]) / duration, s);
     for (size_t i = 0; i < dimensions; i++) {

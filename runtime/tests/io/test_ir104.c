@@ -315,7 +315,7 @@ static void refuses(void **state)
         const char *channels, *name, *value, *reason;
     } bad[] = {
         {"0", "base", "0x300", "parameter channels: 0 is outside 1 to 20"},
-        {"21", "base", "0x300", "parameter channels: 21 is outside 1 to 20"},
+        {"1,21,22", "base", "0x300", "parameter channels: 21 is outside 1 to 20"},
         {"1.5", "base", "0x300", "parameter channels: 1.5 is not a relay's number"},
         {"1,2,1", "base", "0x300", "parameter channels: relay 1 is there twice"},
         {"1,2", "base", "0x200", "0x200 is none of 0x240|0x260|0x280|0x300"},
