@@ -242,6 +242,8 @@ void parameters_set(struct fl_block *block, const struct written *written, size_
         const size_t written_fallback = parameter->fallback && *parameter->fallback;
         const struct written fallback = {parameter->name, line, false, written_fallback,
                                          (const char **)&parameter->fallback};
+        if (value && !value->list && !value->count)
+            continue; /* no value at all, as the reader of the file has said */
         if (!value && !parameter->fallback)
             problem(problems, line, "block %s: parameter %s of %s is missing: %s", block->name, parameter->name,
                     type->name, parameter->summary ? parameter->summary : kind_names[parameter->kind]);
