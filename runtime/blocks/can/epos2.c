@@ -12,6 +12,7 @@ enum {
     COB_TPDO2 = 0x280,
     COB_TPDO3 = 0x380,
     COB_TPDO4 = 0x480,
+    COB_RPDO1 = 0x200,
     COB_RPDO4 = 0x500,
     COB_SDO_ANSWER = 0x580,
     COB_SDO_REQUEST = 0x600,
@@ -514,9 +515,8 @@ size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_com
 
 size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])
 {
-    if (drive->phase != EPOS2_RUNNING)
-        return 0; /* it was disabled first of all, and its PDO may not be mapped yet */
-    out[0] = command_frame(drive, DISABLE_VOLTAGE, idle_target(drive));
+    out[0] = frame_of(COB_RPDO1 + drive->settings.node, 2);
+    put(out[0].data, 2, DISABLE_VOLTAGE);
     return 1;
 }
 

@@ -100,7 +100,8 @@ void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t a
 size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_command *command,
                      struct can_frame out[EPOS2_FRAMES]);
 
-/* The frames that take the power off the motor, whatever the drive is doing. */
+/* The frames that take the power off the motor, in every phase: RPDO1, which carries the control word alone, stays as
+ * the drive is shipped. So this also stops a drive that a program before this one has left running. */
 size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
 
 /* The frames after the last: powerless, and no longer waiting for our heartbeats. */

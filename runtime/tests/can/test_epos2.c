@@ -557,10 +557,11 @@ static void disables_at_once(void **state)
     struct can_frame out[EPOS2_FRAMES];
     struct stub *stub = enabled(usual);
     assert_int_equal(epos2_disable(&stub->engine, out), 1);
-    assert_int_equal(out[0].can_id, 0x505);
-    assert_memory_equal(out[0].data, "\0\0\0\0\0\0", 6);
+    assert_int_equal(out[0].can_id, 0x205);
+    assert_int_equal(out[0].len, 2);
+    assert_memory_equal(out[0].data, "\0\0", 2);
     assert_int_equal(epos2_farewell(&stub->engine, out), 2);
-    assert_int_equal(out[0].can_id, 0x505);
+    assert_int_equal(out[0].can_id, 0x205);
     assert_int_equal(out[1].can_id, 0);
     assert_memory_equal(out[1].data, "\x82\x05", 2);
     test_free(stub);

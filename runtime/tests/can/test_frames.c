@@ -1,4 +1,5 @@
 #define _GNU_SOURCE
+#include "seccomp.h"
 #include "testbed.h"
 
 #include "hub.h"
@@ -190,6 +191,10 @@ static void refuses(void **state)
 {
     (void)state;
     assert_non_null(strstr(testbed_refusal("can-receive", "id", "0x800", NULL), "more than 11 bits: set `extended`"));
+    assert_non_null(strstr(testbed_refusal("epos2", "node", "127", "mode", "current", NULL), "both 127"));
+    /* The testbed's period is 10 ms. */
+    assert_non_null(strstr(testbed_refusal("epos2", "node", "1", "mode", "current", "heartbeat", "0.029", NULL),
+                           "shorter than three periods"));
     assert_non_null(strstr(testbed_refusal("can-send", "id", "0x800", NULL), "more than 11 bits: set `extended`"));
     assert_non_null(strstr(testbed_refusal("can-send", "id", "1", "reset", "00", NULL), "is not 8 bytes"));
     assert_non_null(
@@ -208,6 +213,47 @@ static void needs_its_interface(void **state)
     hub_close();
 }
 
+static void a_drive_is_disabled_by_safe_and_at_the_end(void **state)
+{
+    (void)state;
+    struct can_frame frame;
+    hub_open();
+    struct fl_block *block = testbed_block("epos2", "node", "5", "mode", "velocity", NULL);
+    testbed_begin(block);
+    assert_int_equal(testbed_step(block), FL_OK);
+    while (hub_take(&frame))
+        ;
+    block->type->safe(block);
+    assert_true(hub_take(&frame));
+    assert_int_equal(frame.can_id, 0x205);
+    assert_memory_equal(frame.data, "\0\0", 2);
+    assert_false(hub_take(&frame));
+    testbed_end(block);
+    assert_true(hub_take(&frame));
+    assert_int_equal(frame.can_id, 0x205);
+    assert_true(hub_take(&frame));
+    assert_int_equal(frame.can_id, 0);
+    assert_memory_equal(frame.data, "\x82\x05", 2);
+    hub_close();
+}
+
+static void steps_never_block(void **state)
+{
+    (void)state;
+    hub_open();
+    struct fl_block *blocks[] = {
+        testbed_block("epos2", "node", "5", "mode", "velocity", NULL),
+        testbed_block("can-receive", "id", "5", NULL),
+        testbed_block("can-send", "id", "5", NULL),
+    };
+    for (size_t i = 0; i < 3; i++) {
+        testbed_begin(blocks[i]);
+        steps_under_seccomp(blocks[i], 10);
+        testbed_end(blocks[i]);
+    }
+    hub_close();
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -215,7 +261,8 @@ int main(void)
         cmocka_unit_test(goes_bad_with_age),   cmocka_unit_test(filters),
         cmocka_unit_test(bus_off_is_no_good),  cmocka_unit_test(sends),
         cmocka_unit_test(resets_what_is_old),  cmocka_unit_test(refuses),
-        cmocka_unit_test(needs_its_interface),
+        cmocka_unit_test(needs_its_interface), cmocka_unit_test(a_drive_is_disabled_by_safe_and_at_the_end),
+        cmocka_unit_test(steps_never_block),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -1,0 +1,236 @@
+"""CAN blocks in a task of the real executive, against emulated devices on a bus of UDP sockets."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from images.builder import paths
+from tests.emulators.can_bus import UdpHub
+from tests.emulators.epos2 import Axis, Epos2, Epos2Server
+
+NODE = 3
+PATIENCE = 20  # s, for what takes well under one
+
+DRIVE = """
+period: 5 ms
+priority: 0
+blocks:
+  drive:
+    type: epos2
+    in: {{target: {target}, enable: 1}}
+    parameters: {{node: 3, mode: {mode}, counts: 2000, gear: 10, heartbeat: 0.2{more}}}
+"""
+
+WATCHED = "drive.position,drive.velocity,drive.current,drive.enabled,drive.flag,drive.error,drive.abort,drive.sequence"
+
+Row = dict[str, Any]
+
+
+class Task:
+    """A running task and the rows that it prints."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+
+    def until(self, wanted: Callable[[Row], bool]) -> Row:
+        """The first row that is as wanted."""
+        assert self.process.stdout
+        deadline = time.monotonic() + PATIENCE
+        row: Row = {}
+        for line in self.process.stdout:
+            row = {name.removeprefix("drive."): value for name, value in json.loads(line).items()}
+            if wanted(row):
+                return row
+            assert time.monotonic() < deadline, f"not within {PATIENCE} s; the last row was {row}"
+        raise AssertionError(f"the task ended, status {self.process.wait()}; the last row was {row}")
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        assert self.process.stdout
+        self.process.stdout.read()
+        return self.process.wait(PATIENCE)
+
+
+@pytest.fixture
+def flotilla_run() -> Path:
+    return paths.BUILD / "runtime/flotilla-run"
+
+
+@pytest.fixture(scope="module")
+def udp_can(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shared object that turns CAN sockets into UDP sockets."""
+    library = tmp_path_factory.mktemp("udp_can") / "udp_can.so"
+    source = paths.PROJECT / "runtime/tests/can/udp_can.c"
+    subprocess.run(["cc", "-std=gnu11", "-shared", "-fPIC", "-o", library, source], check=True)
+    return library
+
+
+@pytest.fixture
+def hub() -> Iterator[UdpHub]:
+    hub = UdpHub()
+    yield hub
+    hub.close()
+
+
+@pytest.fixture
+def start(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path) -> Callable[..., Any]:
+    @contextmanager
+    def run(text: str, watched: str = WATCHED) -> Iterator[Task]:
+        path = tmp_path / "task.yml"
+        path.write_text(text)
+        environment = {**os.environ, "LD_PRELOAD": str(udp_can), "CAN_HUB": str(hub.port)}
+        command = [str(flotilla_run), "--watch", watched, str(path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+            try:
+                yield Task(process)
+            finally:
+                process.kill()
+
+    return run
+
+
+def drive_task(mode: str, target: float, more: str = "") -> str:
+    return DRIVE.format(mode=mode, target=target, more=", " + more if more else "")
+
+
+@pytest.mark.parametrize(
+    ("mode", "target", "output"),
+    [
+        ("position", 2.0, "position"),
+        ("profile-position", -2.0, "position"),
+        ("velocity", 12.0, "velocity"),
+        ("profile-velocity", -12.0, "velocity"),
+        ("current", 0.2, "current"),
+    ],
+)
+def test_every_mode_reaches_its_target(start: Any, hub: UdpHub, mode: str, target: float, output: str) -> None:
+    drive = Epos2(NODE)
+    with Epos2Server(hub, drive).running(), start(drive_task(mode, target)) as task:
+        row = task.until(lambda row: abs(row[output] - target) < 0.05 * abs(target))
+        assert row["enabled"] == 1
+        assert row["flag"] == 1
+        assert row["abort"] == 0
+        assert task.end() == 0
+    assert drive.axis is Axis.SWITCH_ON_DISABLED
+
+
+def test_a_refused_object_keeps_the_motor_off(start: Any, hub: UdpHub) -> None:
+    drive = Epos2(NODE)
+    drive.wrong.refuse[0x1603, 2] = 0x06040041
+    server = Epos2Server(hub, drive)
+    with server.running(), start(drive_task("velocity", 1)) as task:
+        assert task.until(lambda row: row["abort"])["abort"] == 0x06040041
+        with server.paused():
+            assert drive.axis is Axis.SWITCH_ON_DISABLED
+            drive.wrong.refuse.clear()
+        assert task.until(lambda row: row["enabled"])["abort"] == 0
+
+
+def test_a_fault_is_told_and_stays(start: Any, hub: UdpHub) -> None:
+    drive = Epos2(NODE)
+    server = Epos2Server(hub, drive)
+    with server.running(), start(drive_task("velocity", 5)) as task:
+        task.until(lambda row: row["enabled"])
+        with server.paused():
+            drive.fault(0x2310)
+        row = task.until(lambda row: not row["enabled"])
+        assert row["flag"] == 1, "the measurements are good all the same"
+        assert task.until(lambda row: row["error"])["error"] == 0x2310
+        sequence = row["sequence"]
+        assert task.until(lambda row: row["sequence"] > sequence + 100)["enabled"] == 0
+        with server.paused():
+            assert drive.axis is Axis.FAULT
+
+
+def test_automatic_reset_clears_a_fault(start: Any, hub: UdpHub) -> None:
+    drive = Epos2(NODE)
+    server = Epos2Server(hub, drive)
+    with server.running(), start(drive_task("velocity", 5, "fault_reset: automatic")) as task:
+        task.until(lambda row: row["enabled"])
+        with server.paused():
+            drive.fault(0x8611)
+        task.until(lambda row: not row["enabled"])
+        assert task.until(lambda row: row["enabled"])["error"] == 0
+
+
+def test_a_drive_that_lost_its_power_comes_back(start: Any, hub: UdpHub) -> None:
+    drive = Epos2(NODE)
+    server = Epos2Server(hub, drive)
+    with server.running(), start(drive_task("velocity", 5)) as task:
+        task.until(lambda row: row["enabled"])
+        with server.paused():
+            drive.power_off()
+        task.until(lambda row: not row["flag"])
+        with server.paused():
+            drive.power_on()
+        task.until(lambda row: row["enabled"] and row["velocity"] > 4.5)
+
+
+def test_a_stopped_task_stops_the_motor(start: Any, hub: UdpHub) -> None:
+    """SIGSTOP: nothing of the task runs any more, so the drive misses its heartbeats."""
+    drive = Epos2(NODE)
+    server = Epos2Server(hub, drive)
+    with server.running(), start(drive_task("velocity", 5)) as task:
+        task.until(lambda row: row["velocity"] > 4.5)
+        task.process.send_signal(signal.SIGSTOP)
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            with server.paused():
+                if drive.axis is Axis.FAULT:
+                    break
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert drive.errors == [0x8130]
+        assert abs(drive.motor.rpm) < 5
+
+
+def test_survives_a_bad_bus(start: Any, hub: UdpHub) -> None:
+    """Frames lost, and frames of random content under the drive's own identifiers."""
+    drive = Epos2(NODE, seed=4)
+    drive.wrong.loss = 0.02
+    drive.wrong.nonsense = 0.02
+    with Epos2Server(hub, drive).running(), start(drive_task("velocity", 5, "fault_reset: automatic")) as task:
+        task.until(lambda row: row["enabled"] and abs(row["velocity"] - 5) < 0.5)
+        task.until(lambda row: row["sequence"] > 500)
+
+
+def test_a_silent_drive_makes_the_flag_0(start: Any, hub: UdpHub) -> None:
+    drive = Epos2(NODE)
+    server = Epos2Server(hub, drive)
+    with server.running(), start(drive_task("velocity", 5)) as task:
+        task.until(lambda row: row["flag"])
+        with server.paused():
+            drive.wrong.silent = True
+        task.until(lambda row: not row["flag"])
+        with server.paused():
+            drive.wrong.silent = False
+        task.until(lambda row: row["flag"])
+
+
+def test_frames_pass_between_two_blocks(start: Any, hub: UdpHub) -> None:
+    text = """
+period: 5 ms
+priority: 0
+blocks:
+  out: {type: can-send, in: {data: 7}, parameters: {id: 0x123, length: 1}}
+  back: {type: can-receive, parameters: {id: 0x123}}
+"""
+    with (
+        Epos2Server(hub).running(),  # without a drive: the hub passes frames on while it is read
+        start(text, "out.sent,out.flag,back.data,back.length,back.flag,back.sequence") as task,
+    ):
+        row = task.until(lambda row: row["back.sequence"] > 5)
+        assert row["back.data"] == [7, 0, 0, 0, 0, 0, 0, 0]
+        assert row["back.length"] == 1
+        assert row["back.flag"] == row["out.flag"] == 1
+        assert row["out.sent"] >= row["back.sequence"]

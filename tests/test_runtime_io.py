@@ -1,0 +1,347 @@
+"""UDP, indoor positioning, message queues and the relay board in tasks of the real executive."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from images.builder import paths
+from tests.emulators.igps import Faults, Igps
+
+PATIENCE = 20
+"""Seconds, for what takes well under one."""
+
+Row = dict[str, Any]
+
+
+class Task:
+    """A running task and the rows that it prints."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+
+    def rows(self) -> Iterator[Row]:
+        assert self.process.stdout
+        deadline = time.monotonic() + PATIENCE
+        for line in self.process.stdout:
+            assert time.monotonic() < deadline, f"not within {PATIENCE} s; the last row was {line}"
+            yield {name.rpartition(".")[2]: value for name, value in json.loads(line).items()}
+
+    def until(self, wanted: Callable[[Row], bool]) -> Row:
+        """The first row that is as wanted."""
+        row: Row = {}
+        for row in self.rows():
+            if wanted(row):
+                return row
+        raise AssertionError(f"the task ended, status {self.process.wait()}; the last row was {row}")
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        assert self.process.stdout
+        self.process.stdout.read()
+        return self.process.wait(PATIENCE)
+
+
+Start = Callable[..., AbstractContextManager[Task]]
+
+
+@pytest.fixture(scope="module")
+def flotilla_run() -> Path:
+    """Built by: meson setup build/runtime runtime; ninja -C build/runtime"""
+    return paths.BUILD / "runtime" / "flotilla-run"
+
+
+@pytest.fixture
+def start(flotilla_run: Path, tmp_path: Path) -> Start:
+    @contextmanager
+    def run(name: str, text: str, *options: str) -> Iterator[Task]:
+        path = tmp_path / f"{name}.yml"
+        path.write_text(text)
+        command = [str(flotilla_run), *options, str(path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                yield Task(process)
+            finally:
+                process.kill()
+
+    return run
+
+
+@pytest.fixture
+def refusal(flotilla_run: Path, tmp_path: Path) -> Callable[..., tuple[int, str]]:
+    """What flotilla-run says of a task, and its status."""
+
+    def run(text: str, *options: str, under: tuple[str, ...] = ()) -> tuple[int, str]:
+        path = tmp_path / "task.yml"
+        path.write_text(text)
+        ended = subprocess.run(
+            [*under, flotilla_run, *options, "task.yml"], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE
+        )
+        return ended.returncode, ended.stderr
+
+    return run
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+        somebody.bind(("127.0.0.1", 0))
+        port: int = somebody.getsockname()[1]
+        return port
+
+
+# --- indoor positioning ---
+
+IGPS = """
+period: 5 ms
+priority: 0
+blocks:
+  igps:
+    type: igps
+    parameters: {{port: {port}, local_address: 127.0.0.1, from: 127.0.0.1, range: 50, timeout: 0.2}}
+"""
+
+IGPS_SIGNALS = ",".join(f"igps.{name}" for name in ("position", "flag", "age", "sequence", "refused"))
+
+
+def path_of(seconds: float) -> tuple[float, float]:
+    """Along x, a metre a second."""
+    return seconds, 0.5
+
+
+def test_position_is_the_robots(start: Start) -> None:
+    port = free_port()
+    with (
+        start("igps", IGPS.format(port=port), "--watch", IGPS_SIGNALS) as task,
+        Igps(("127.0.0.1", port), path_of, rate=64) as igps,
+    ):
+        seen = []
+        for row in task.rows():
+            if row["flag"]:
+                assert row["position"][1] == 0.5
+                seen.append(row["position"][0])
+            if row["sequence"] >= 32:
+                break
+        assert seen == sorted(seen)
+        assert {x * 64 % 1 for x in seen} == {0.0}  # of its clock's ticks, to the last bit
+        assert seen[-1] >= 31 / 64
+        assert task.end() == 0
+    assert igps.sent >= 32
+
+
+def test_silence_is_flagged_and_ends(start: Start) -> None:
+    port = free_port()
+    with (
+        start("igps", IGPS.format(port=port), "--watch", IGPS_SIGNALS) as task,
+        Igps(("127.0.0.1", port), path_of, rate=100) as igps,
+    ):
+        task.until(lambda row: row["flag"] == 1)
+        igps.faults = Faults(loss=1)
+        silent = task.until(lambda row: row["flag"] == 0)
+        assert silent["age"] > 0.2
+        assert silent["position"][1] == 0.5
+        igps.faults = Faults()
+        assert task.until(lambda row: row["flag"] == 1)["age"] <= 0.2
+        igps.faults = Faults(blind=1)
+        assert task.until(lambda row: row["flag"] == 0)["position"][1] == 0.5
+        igps.faults = Faults()
+        task.until(lambda row: row["flag"] == 1)
+
+
+def test_nothing_bad_is_taken_for_a_position(start: Start) -> None:
+    port = free_port()
+    bad = Faults(loss=0.1, garbage=0.3, blind=0.2, wild=0.2, burst=3)
+    with (
+        start("igps", IGPS.format(port=port), "--watch", IGPS_SIGNALS) as task,
+        Igps(("127.0.0.1", port), path_of, rate=512, faults=bad),
+    ):
+        for row in task.rows():
+            x, y = row["position"]
+            if row["sequence"]:
+                assert y == 0.5
+                assert 0 <= x < 50
+                assert x * 512 % 1 == 0
+            if row["sequence"] >= 100:
+                assert row["refused"] > 0
+                break
+
+
+# --- UDP from task to task ---
+
+SENDER = """
+period: 10 ms
+priority: 0
+blocks:
+  udp:
+    type: udp-send
+    in: {{data: [70, 108, 111, 255]}}
+    parameters: {{address: 127.0.0.1, port: {port}, length: 4, dscp: 46}}
+"""
+
+RECEIVER = """
+period: 10 ms
+priority: 0
+blocks:
+  udp:
+    type: udp-receive
+    parameters: {{port: {port}, length: {length}, timeout: 0.2}}
+"""
+
+RECEIVED = "udp.data,udp.flag,udp.sequence,udp.dropped,udp.refused"
+
+
+def test_udp_from_task_to_task(start: Start) -> None:
+    port = free_port()
+    with (
+        start("receiver", RECEIVER.format(port=port, length=4), "--watch", RECEIVED) as receiver,
+        start("sender", SENDER.format(port=port)) as sender,
+    ):
+        row = receiver.until(lambda row: row["sequence"] >= 10)
+        assert row["data"] == [70, 108, 111, 255]
+        assert row["flag"] == 1
+        assert row["refused"] == 0
+        sender.process.send_signal(signal.SIGSTOP)
+        assert receiver.until(lambda row: row["flag"] == 0)["data"] == [70, 108, 111, 255]
+        sender.process.send_signal(signal.SIGCONT)
+        receiver.until(lambda row: row["flag"] == 1)
+        assert sender.end() == 0
+        receiver.until(lambda row: row["flag"] == 0)
+
+
+def test_udp_of_another_length_is_refused(start: Start) -> None:
+    port = free_port()
+    with (
+        start("receiver", RECEIVER.format(port=port, length=5), "--watch", RECEIVED) as receiver,
+        start("sender", SENDER.format(port=port)),
+    ):
+        row = receiver.until(lambda row: row["refused"] >= 5)
+        assert (row["flag"], row["sequence"]) == (0, 0)
+
+
+def test_a_port_is_for_one(start: Start, refusal: Callable[..., tuple[int, str]]) -> None:
+    port = free_port()
+    with start("receiver", RECEIVER.format(port=port, length=4), "--watch", RECEIVED) as receiver:
+        receiver.until(lambda row: True)
+        status, said = refusal(RECEIVER.format(port=port, length=4))
+    assert status == 1
+    assert f"udp: UDP port {port} is taken: another block or program receives there" in said
+
+
+# --- queues from task to task ---
+
+QUEUE_SENDER = """
+period: 10 ms
+priority: 0
+blocks:
+  queue:
+    type: queue-send
+    in: {{data: [2.5, -1]}}
+    parameters: {{name: {name}, width: 2}}
+"""
+
+QUEUE_RECEIVER = """
+period: 50 ms
+priority: 0
+blocks:
+  queue:
+    type: queue-receive
+    parameters: {{name: {name}, width: 2, timeout: 0.3}}
+"""
+
+QUEUED = "queue.data,queue.flag,queue.age,queue.sequence,queue.dropped"
+
+
+@pytest.fixture
+def queue(tmp_path: Path) -> Iterator[str]:
+    """A name that no other test uses."""
+    name = f"/flotilla-{os.getpid()}-{tmp_path.name}"
+    yield name
+    Path("/dev/mqueue", name[1:]).unlink(missing_ok=True)
+
+
+def test_queue_between_two_rates(start: Start, queue: str) -> None:
+    with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
+        assert receiver.until(lambda row: True)["flag"] == 0
+        with start("sender", QUEUE_SENDER.format(name=queue), "--steps", "50") as sender:
+            row = receiver.until(lambda row: row["flag"] == 1)
+            assert row["data"] == [2.5, -1]
+            assert sender.process.wait(PATIENCE) == 0
+        row = receiver.until(lambda row: row["flag"] == 0)
+        assert row["age"] > 0.3
+        assert row["sequence"] + row["dropped"] == 50  # none unaccounted for
+        assert receiver.end() == 0
+
+
+def test_queue_outlives_a_killed_task(start: Start, queue: str) -> None:
+    with start("sender", QUEUE_SENDER.format(name=queue)) as sender:
+        for _ in range(2):
+            with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
+                receiver.until(lambda row: row["flag"] == 1)
+                receiver.process.kill()
+                receiver.process.wait()
+        with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
+            sender.process.kill()
+            sender.process.wait()
+            receiver.until(lambda row: row["flag"] == 0)
+            with start("sender", QUEUE_SENDER.format(name=queue)):
+                receiver.until(lambda row: row["flag"] == 1)
+
+
+def test_queue_of_another_width_is_explained(start: Start, refusal: Callable[..., tuple[int, str]], queue: str) -> None:
+    with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
+        receiver.until(lambda row: True)
+        status, said = refusal(
+            QUEUE_SENDER.format(name=queue).replace("width: 2", "width: 1").replace("[2.5, -1]", "1")
+        )
+    assert status == 1
+    assert f"queue: queue {queue} holds 10 messages of 32 bytes, and a running task uses it" in said
+
+
+# --- relay board ---
+
+RELAYS = """
+period: 10 ms
+blocks:
+  relays:
+    type: ir104-pbf
+    in: {{command: {command}, flag: 1}}
+    parameters:
+      {parameters}
+"""
+
+
+def test_relays_are_checked(refusal: Callable[..., tuple[int, str]]) -> None:
+    good = RELAYS.format(command="[1, 0, 0]", parameters="{channels: [1, 20, 9], base: 0x240, reset: [0, 0, 1]}")
+    assert refusal(good, "--check") == (0, "")
+    inputs_alone = "period: 10 ms\nblocks:\n  relays: {type: ir104-pbf}\n"
+    assert refusal(inputs_alone, "--check") == (0, "")
+    status, said = refusal(
+        RELAYS.format(command="[1, 0]", parameters="{channels: [1, 21], base: 0x320, timeout: 0}"), "--check"
+    )
+    assert status == 2
+    for reason in (
+        "task.yml:8: block relays: parameter channels: 21 is outside 1 to 20",
+        "task.yml:8: block relays: parameter base: 0x320 is none of 0x240|0x260|0x280|0x300",
+        "task.yml:8: block relays: parameter timeout: 0 is outside 0.001 to 60 s",
+    ):
+        assert reason in said
+
+
+def test_relays_need_a_privilege(refusal: Callable[..., tuple[int, str]]) -> None:
+    """Without it, so that no test ever touches the ports of the computer it runs on."""
+    task = RELAYS.format(command="[1, 0]", parameters="{channels: [1, 2]}")
+    under = ("setpriv", "--bounding-set=-sys_rawio", "--inh-caps=-sys_rawio") if os.geteuid() == 0 else ()
+    for options in ((), ("--safe",)):
+        status, said = refusal(task, *options, under=under)
+        assert status == 1
+        assert "relays: I/O ports 0x300 to 0x307" in said
+        assert "CAP_SYS_RAWIO" in said or "Function not implemented" in said  # a kernel without ioperm()
