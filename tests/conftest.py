@@ -116,6 +116,14 @@ def fresh_guest(fleet: Fleet, artefacts: Path) -> Iterator[GuestFactory]:
         yield lambda number, **arguments: _boot(fleet, number, artefacts / f"robot{number}", cleanup, **arguments)
 
 
+@pytest.fixture(scope="module")
+def module_guest(fleet: Fleet, request: pytest.FixtureRequest, session_artefacts: Path) -> Iterator[GuestFactory]:
+    """Like `fresh_guest`, for all tests of a module."""
+    with ExitStack() as cleanup:
+        place = session_artefacts / request.node.name.removesuffix(".py").replace("/", "-")
+        yield lambda number, **arguments: _boot(fleet, number, place / f"robot{number}", cleanup, **arguments)
+
+
 @pytest.fixture
 def segment(fleet: Fleet, artefacts: Path) -> Iterator[Segment]:
     """An Ethernet segment with a cable for each robot of the fleet, for `fresh_guest(3, segment=segment)`.

@@ -555,7 +555,12 @@ def _devices(raw: dict[str, Any]) -> Iterator[Finding]:
 def _tasks(raw: dict[str, Any]) -> Iterator[Finding]:
     there = sorted(path.stem for path in paths.TASKS.glob("*.yml"))
     for name, robot in raw["robots"].items():
-        named = {("robots", name, "tasks", index): task for index, task in enumerate(robot.get("tasks", ()))}
+        tasks = robot.get("tasks")
+        named = {
+            ("robots", name, "tasks", index): task
+            for index, task in enumerate(tasks if isinstance(tasks, list) else ())
+            if isinstance(task, str)
+        }
         for loc, task, _ in _again(named.items()):
             yield loc, f"{task} is listed already", "each task once"
         for loc, task in named.items():
