@@ -59,6 +59,7 @@ class RelayPorts:
     def __exit__(self, *_: object) -> None:
         self._waker.close()
         self._thread.join()
+        self._wake.close()
         for listener in self._listeners:
             listener.close()
 
@@ -150,7 +151,7 @@ class Loop:
         return self.firing == on
 
     def unit(self, name: str) -> str:
-        return self.robot.shell.run(["systemctl", "show", "-P", name, UNIT]).stdout.strip()
+        return self.robot.shell.run(["sudo", "systemctl", "show", "-P", name, UNIT]).stdout.strip()
 
     def main_pid(self) -> int:
         return int(self.unit("MainPID"))
@@ -193,7 +194,7 @@ def test_a_gyro_that_is_unplugged_closes_the_valves_until_it_is_back(loop: Loop)
     loop.gyro.unplug()
     assert loop.wait_relays(on=False), "valves stay open without a gyro"
     switched = len(loop.board.log)
-    loop.robot.shell.run(["systemctl", "is-active", UNIT])  # a second or so in which nothing may move
+    loop.robot.shell.run(["sudo", "systemctl", "is-active", UNIT])  # a second or so in which nothing may move
     assert len(loop.board.log) == switched
     loop.gyro.replug()
     assert loop.wait_relays(on=True), "control does not resume"
@@ -222,7 +223,7 @@ def test_a_killed_executive_is_restarted(loop: Loop, record_property: Callable[[
     wait_restarted(loop, pid)
     loop.plant.kick(math.radians(15))
     assert loop.wait_relays(on=True), "the restarted task does not control"
-    said = loop.robot.shell.run(["journalctl", "-o", "json", "-u", UNIT, "--no-pager"]).stdout.splitlines()
+    said = loop.robot.shell.run(["sudo", "journalctl", "-o", "json", "-u", UNIT, "--no-pager"]).stdout.splitlines()
     entries = [json.loads(line) for line in said]
     died = [e for e in entries if "killed" in str(e["MESSAGE"]) and "KILL" in str(e["MESSAGE"])][-1]
     started = [e for e in entries if str(e["MESSAGE"]).startswith("Started")][-1]
@@ -237,7 +238,7 @@ def wait_restarted(loop: Loop, pid: int) -> None:
         f'[ "$(systemctl show -P MainPID {UNIT})" != {pid} ] && systemctl -q is-active {UNIT} && exit; sleep 0.1; '
         "done; exit 1"
     )
-    loop.robot.shell.run(["sh", "-c", script])
+    loop.robot.shell.run(["sudo", "sh", "-c", script], timeout=120)
 
 
 def test_the_task_has_only_the_privileges_it_needs(loop: Loop) -> None:
@@ -269,7 +270,7 @@ def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:
 
 
 def test_task_on_the_other_architecture(guest: GuestFactory) -> None:
-    state = guest(2).shell.run(["systemctl", "show", "-P", "ActiveState", "flotilla-task@heartbeat.service"])
+    state = guest(2).shell.run(["sudo", "systemctl", "show", "-P", "ActiveState", "flotilla-task@heartbeat.service"])
     assert state.stdout.strip() == "active"
 
 

@@ -341,3 +341,23 @@ def test_blocks_are_listed_with_ports_units_and_source(flotilla_run: Path) -> No
     wrong = subprocess.run([program, "gian"], capture_output=True, text=True, check=False)
     assert wrong.returncode == 2
     assert "the nearest is gain" in wrong.stderr
+
+
+def test_the_worked_example_is_a_block(tasks: Tasks, tmp_path: Path) -> None:
+    """What docs/blocks.md shows compiles without a warning and does what it says."""
+    source = tmp_path / "deadband.c"
+    source.write_text((paths.PROJECT / "docs" / "blocks.md").read_text().split("```c\n")[1].split("```")[0])
+    compile_shared(source, tmp_path / "deadband.so", f"-I{HEADERS}")
+    made = Tasks(tasks.program, tmp_path, tmp_path)
+    text = task(
+        "small: {type: deadband, in: {in: 0.5}, parameters: {width: 1}}\n"
+        "large: {type: deadband, in: {in: -1.5}, parameters: {width: 1}}"
+    )
+    ended = made.run(text, "--steps", "1", "--watch", "small.out,large.out")
+    assert [(row["small.out"], row["large.out"]) for row in ended.rows] == [(0, -1.5)]
+
+
+def test_the_example_tasks_are_right(tasks: Tasks) -> None:
+    for file in sorted(paths.TASKS.glob("*.yml")):
+        done = subprocess.run(tasks.argv(file.read_text(), "--check"), capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, ""), file.name
