@@ -47,6 +47,7 @@ _RECIPES = {
     "tools": _Recipe("amd64", ("tools",), system=False),
     "toolchain": _Recipe("amd64", ("toolchain",), system=False),
     "verify": _Recipe("i386", ("verify",), system=False),
+    "emulator": _Recipe("amd64", ("emulator",), system=False),
 }
 NAMES = tuple(_RECIPES)
 
