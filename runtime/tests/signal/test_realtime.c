@@ -29,6 +29,7 @@ static void compute(void **state)
     steps(testbed_block("low-pass", "time_constant", "1", NULL));
     steps(testbed_block("pack", "types", "double", NULL));
     steps(testbed_block("pid", "kp", "1", "min", "-1", "max", "1", NULL));
+    steps(testbed_block("rotate", NULL));
     steps(testbed_block("schmitt-trigger", "on", "1", "off", "0", NULL));
     steps(testbed_block("select", NULL));
     steps(testbed_block("sum", NULL));
