@@ -8,9 +8,13 @@ something that it depends on is missing.
 from __future__ import annotations
 
 import difflib
+import fnmatch
+import io
 import json
 import re
 import shutil
+import subprocess
+import tarfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +42,8 @@ class Recipe(pydantic.BaseModel):
     """Debian's name of the architecture."""
     fragments: tuple[str, ...]
     """Names of files in `kernel/fragments/`, without `.config`."""
+    modules: bool = True
+    """Whether its modules are built and packaged. The kernel itself is the same without them."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,25 @@ class Kernel:
         """The Debian package."""
         (package,) = self.directory.glob("*.deb")
         return package
+
+    def file(self, pattern: str) -> bytes:
+        """Content of the one file of the package whose path matches."""
+        listing = ["dpkg-deb", "--fsys-tarfile", str(self.package)]
+        content = subprocess.run(listing, stdout=subprocess.PIPE, check=True).stdout
+        with tarfile.open(fileobj=io.BytesIO(content)) as archive:
+            (found,) = (entry for entry in archive if entry.isfile() and fnmatch.fnmatch(entry.name, pattern))
+            extracted = archive.extractfile(found)
+            assert extracted is not None, "it is a file"
+            return extracted.read()
+
+    @property
+    def image(self) -> Path:
+        """What a boot loader loads."""
+
+        def unpack(out: Path) -> None:
+            (out / "vmlinuz").write_bytes(self.file("./boot/vmlinuz-*"))
+
+        return cache.result("vmlinuz", self.directory.name.removeprefix("kernel-"), unpack) / "vmlinuz"
 
     @property
     def release(self) -> str:
@@ -199,7 +224,10 @@ def build(name: str) -> Kernel:
     lock = read_lock("toolchain")
     origin = source(lock.packages)
     made_by = [Path(kernel_stage.__file__), Path(kernel_stage.__file__).with_name("chroot.py")]
-    key = cache.digest(lock.digest, recipe(name).architecture, request(options.values()), *made_by)
+    modules = recipe(name).modules
+    key = cache.digest(
+        lock.digest, recipe(name).architecture, request(options.values()), f"modules {modules}", *made_by
+    )
 
     def make(out: Path) -> None:
         free = shutil.disk_usage(paths.BUILD).free
@@ -213,7 +241,7 @@ def build(name: str) -> Kernel:
         log = paths.BUILD / f"kernel-{name}.log"
         stage = kernel_stage.Description(
             tools=str(toolchain), out=str(out), architecture=recipe(name).architecture, source=origin.name,
-            version=origin.version, epoch=lock.epoch,
+            version=origin.version, epoch=lock.epoch, modules=modules,
         )  # fmt: skip
         (out / "request.config").write_text(request(options.values()))
         with progress.step(f"configure kernel {name}"):

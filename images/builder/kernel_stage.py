@@ -35,6 +35,8 @@ class Description:
     version: str
     """Of that package."""
     epoch: int
+    modules: bool
+    """Whether the package holds modules, too."""
 
 
 class Stage:
@@ -70,19 +72,15 @@ class Stage:
 
     def build(self) -> None:
         """Compile, and leave the Debian package and `kernel.json`."""
-        self.chroot.log(*self.make, f"-j{os.cpu_count()}", "bzImage", "modules")
+        targets = ["bzImage", "modules"] if self.description.modules else ["bzImage"]
+        self.chroot.log(*self.make, f"-j{os.cpu_count()}", *targets)
         release = self.chroot.run(*self.make, "-s", "kernelrelease").strip()
         package = self.out / "package"
-        self.chroot.run(
-            *self.make,
-            "-s",
-            "INSTALL_MOD_PATH=/out/package",
-            "INSTALL_MOD_STRIP=1",
-            "DEPMOD=/usr/sbin/depmod",
-            "modules_install",
-        )
-        modules = package / "lib/modules" / release
-        (modules / "build").unlink(missing_ok=True)  # a link into this build
+        package.mkdir()
+        if self.description.modules:
+            install = ["INSTALL_MOD_PATH=/out/package", "INSTALL_MOD_STRIP=1", "DEPMOD=/usr/sbin/depmod"]
+            self.chroot.run(*self.make, "-s", *install, "modules_install")
+            (package / "lib/modules" / release / "build").unlink(missing_ok=True)  # a link into this build
         boot = package / "boot"
         boot.mkdir()
         shutil.copy(self.out / "objects/arch/x86/boot/bzImage", boot / f"vmlinuz-{release}")

@@ -49,6 +49,7 @@ _RECIPES = {
     "runtime-i386": _Recipe("i386", ("runtime",), system=False),
     "runtime-amd64": _Recipe("amd64", ("runtime",), system=False),
     "verify": _Recipe("i386", ("verify",), system=False),
+    "emulator": _Recipe("amd64", ("emulator",), system=False),
 }
 NAMES = tuple(_RECIPES)
 

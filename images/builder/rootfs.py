@@ -160,9 +160,11 @@ def main(description_file: str) -> None:
     (stage.target / "boot").mkdir()
     with _timed("squashfs"):
         _settle_times(stage)
+        actions = [f'uncompressed@pathname("{pattern.lstrip("/")}")\n' for pattern in _list("uncompressed.list")]
+        (stage.tools / "tmp/actions").write_text("".join(actions))
         stage.in_tools(
             "env", "-u", "SOURCE_DATE_EPOCH", "mksquashfs", "/target", "/out/root.squashfs", *COMPRESSION,
-            "-noappend", "-no-progress", "-exports",
+            "-noappend", "-no-progress", "-exports", "-action-file", "/tmp/actions",
             "-mkfs-time", str(stage.epoch), "-all-time", str(stage.epoch),
             "-wildcards", "-e", "dev/*", "proc/*", "sys/*", "run/*", "tmp/*", "debootstrap",
         )  # fmt: skip

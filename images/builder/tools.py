@@ -44,6 +44,12 @@ def tree(lock: Lock) -> Path:
     return cache.result("tools", cache.digest(lock.digest, Path(__file__)), unpack)
 
 
+def command(tree: Path, program: str) -> list[str]:
+    """What runs a program of a tree (`usr/sbin/mke2fs`) by the tree's own dynamic loader and libraries."""
+    loader, libraries = tree / "lib64/ld-linux-x86-64.so.2", tree / "usr/lib/x86_64-linux-gnu"
+    return [str(loader), "--library-path", str(libraries), str(tree / program)]
+
+
 class Tools:
     """Runs the unpacked tools on files of the caller, with time stopped at `epoch`."""
 
@@ -60,9 +66,7 @@ class Tools:
 
     def run(self, program: str, *arguments: str | Path, stdin: str | None = None) -> str:
         """Run a tool by its path in the tree (`usr/sbin/mke2fs`); its standard output."""
-        loader = self.directory / "lib64/ld-linux-x86-64.so.2"
-        library = self.directory / "usr/lib/x86_64-linux-gnu"
-        argv = [str(loader), "--library-path", str(library), str(self.directory / program), *map(str, arguments)]
+        argv = [*command(self.directory, program), *map(str, arguments)]
         progress.command([program, *map(str, arguments)])
         done = subprocess.run(argv, env=self._environment, input=stdin, capture_output=True, encoding="utf-8")
         if done.returncode != 0:

@@ -142,7 +142,9 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int6
         }
         int64_t stamp_ns = read_control(receiver, &message);
         if ((size_t)got == length && from_right(receiver, &sender)) {
-            *arrived_ns = udp_arrival_ns(stamp_ns, wall_ns(), fl_now_ns(), receiver->emptied_ns);
+            /* In this order: what delays between the two lets the datagram look older, never younger. */
+            int64_t now_ns = fl_now_ns();
+            *arrived_ns = udp_arrival_ns(stamp_ns, wall_ns(), now_ns, receiver->emptied_ns);
             return true;
         }
         receiver->refused++;

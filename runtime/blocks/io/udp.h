@@ -69,7 +69,8 @@ int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_
 
 /* Take the next datagram, which must be of `length` bytes and is refused otherwise. Each call takes one off `budget`,
  * UDP_BURST at the begin of a step, and there is none for a budget of 0. `arrived_ns` is when the kernel got it
- * (SO_TIMESTAMPNS, see socket(7)), on CLOCK_MONOTONIC. */
+ * (SO_TIMESTAMPNS, see socket(7)), on CLOCK_MONOTONIC; in the first moments after the first socket of a computer asked
+ * for stamps, when it was read. */
 bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int64_t *arrived_ns, int *budget);
 
 void udp_receiver_close(struct udp_receiver *receiver);

@@ -1,6 +1,6 @@
-#define _GNU_SOURCE
+#include "wall_clock.h"
+
 #include <flotilla/block.h>
-#include <time.h>
 
 enum { TIME, STEP, MONOTONIC, OFFSET, WALL_NS, WALL };
 
@@ -28,16 +28,6 @@ static const struct fl_port outputs[] = {
      .summary = "when this step was due, since 1970-01-01 UTC"},
     {.name = "wall", .type = FL_DOUBLE, .width = 1, .unit = "s", .summary = "the same, rounded to 0.24 µs"},
 };
-
-/* The vDSO answers both clocks without entering the kernel. */
-static int64_t wall_less_monotonic_ns(void)
-{
-    struct timespec wall;
-    int64_t before = fl_now_ns();
-    clock_gettime(CLOCK_REALTIME, &wall);
-    int64_t after = fl_now_ns();
-    return wall.tv_sec * INT64_C(1000000000) + wall.tv_nsec - (before + (after - before) / 2);
-}
 
 static int step(struct fl_block *block)
 {

@@ -6,7 +6,7 @@
 #include <math.h>
 #include <string.h>
 
-static bool is_name(const char *text)
+bool layout_is_name(const char *text)
 {
     if (!isalpha((unsigned char)*text))
         return false;
@@ -27,7 +27,7 @@ static int make_field(struct fl_block *block, const struct layout_parameters *pa
     field->name = parameters->names.count ? parameters->names.value[i] : port_numbered(block, stem, i);
     if (!field->name)
         return FL_FAILED;
-    if (!is_name(field->name))
+    if (!layout_is_name(field->name))
         return fl_fail(block, "names: \"%s\" is not a letter, then letters, digits, _ or -", field->name);
     field->type = (enum fl_type)type;
     field->width = (uint32_t)width;

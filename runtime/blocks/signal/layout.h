@@ -42,6 +42,9 @@ struct layout_parameters {
 int layout_make(struct fl_block *block, struct layout_parameters parameters, const char *stem, size_t start,
                 size_t alignment, struct layout *layout);
 
+/* A letter, then letters, digits, _ or -. */
+bool layout_is_name(const char *text);
+
 /* Add a port for each, by fl_add_input or fl_add_output. */
 int layout_add_ports(struct fl_block *block, const struct layout *layout,
                      int (*add)(struct fl_block *block, struct fl_port port), const char *summary);

@@ -104,7 +104,7 @@ static void follows(void **state)
 {
     (void)state;
     struct system system = a_system();
-    struct fl_block *igps = testbed_block("igps", "port", system.port, "range", "10", NULL);
+    struct fl_block *igps = testbed_block("igps", "port", system.port, "range", "10", "timeout", "60", NULL);
     testbed_begin(igps);
     step(igps);
     assert_false(GET(igps, "flag", bool));
@@ -127,7 +127,8 @@ static void follows_big_endian(void **state)
 {
     (void)state;
     struct system system = a_system();
-    struct fl_block *igps = testbed_block("igps", "port", system.port, "byte_order", "big-endian", NULL);
+    struct fl_block *igps =
+        testbed_block("igps", "port", system.port, "byte_order", "big-endian", "timeout", "60", NULL);
     testbed_begin(igps);
     send_bytes(&system, big, 16);
     step(igps);
@@ -141,7 +142,7 @@ static void flags_what_cannot_be(void **state)
 {
     (void)state;
     struct system system = a_system();
-    struct fl_block *igps = testbed_block("igps", "port", system.port, "range", "10", NULL);
+    struct fl_block *igps = testbed_block("igps", "port", system.port, "range", "10", "timeout", "60", NULL);
     testbed_begin(igps);
     send_position(&system, 1, 2);
     send_position(&system, NAN, 2); /* does not see the robot any more */
@@ -167,15 +168,16 @@ static void flags_silence(void **state)
 {
     (void)state;
     struct system system = a_system();
-    struct fl_block *igps = testbed_block("igps", "port", system.port, "timeout", "0.25", NULL);
+    struct fl_block *igps = testbed_block("igps", "port", system.port, "timeout", "60", NULL);
     testbed_begin(igps);
     send_position(&system, 1, 2);
-    step(igps);
+    igps->release_ns = fl_now_ns() + 1000000 - igps->period_ns; /* an age above zero, even if stamped when read */
+    testbed_step(igps);
     int64_t arrived = igps->release_ns - llround(GET(igps, "age", double) * 1e9);
-    igps->release_ns = arrived + 250000000 - igps->period_ns;
+    igps->release_ns = arrived + 60000000000 - igps->period_ns;
     testbed_step(igps);
     assert_true(GET(igps, "flag", bool));
-    igps->release_ns = arrived + 250000001 - igps->period_ns;
+    igps->release_ns = arrived + 60000000001 - igps->period_ns;
     testbed_step(igps);
     assert_false(GET(igps, "flag", bool));
     assert_near(position_of(igps)[0], 2, 0);

@@ -60,7 +60,8 @@ static void carries_every_type(void **state)
     for (int type = 0; type < FL_TYPES; type++) {
         const char *type_name = fl_type_name((enum fl_type)type);
         struct fl_block *send = testbed_block("queue-send", "name", name, "type", type_name, "width", "3", NULL);
-        struct fl_block *receive = testbed_block("queue-receive", "name", name, "type", type_name, "width", "3", NULL);
+        struct fl_block *receive =
+            testbed_block("queue-receive", "name", name, "type", type_name, "width", "3", "timeout", "60", NULL);
         size_t bytes = 3 * fl_type_size((enum fl_type)type);
         assert_int_equal(send->in_ports[0].type, type);
         testbed_begin(receive);
@@ -150,7 +151,7 @@ static void ages_from_sending(void **state)
 {
     (void)state;
     struct fl_block *send = testbed_block("queue-send", "name", name, NULL);
-    struct fl_block *receive = testbed_block("queue-receive", "name", name, "timeout", "0.05", NULL);
+    struct fl_block *receive = testbed_block("queue-receive", "name", name, "timeout", "60", NULL);
     testbed_begin(send);
     testbed_begin(receive);
     int64_t before = fl_now_ns();
@@ -161,10 +162,10 @@ static void ages_from_sending(void **state)
     int64_t sent = receive->release_ns - llround(GET(receive, "age", double) * 1e9);
     assert_in_range(sent, before, after);
     assert_true(GET(receive, "flag", bool));
-    receive->release_ns = sent + 50000000 - receive->period_ns;
+    receive->release_ns = sent + 60000000000 - receive->period_ns;
     step(receive);
     assert_true(GET(receive, "flag", bool));
-    receive->release_ns = sent + 50000001 - receive->period_ns;
+    receive->release_ns = sent + 60000000001 - receive->period_ns;
     step(receive);
     assert_false(GET(receive, "flag", bool));
     assert_near(GET(receive, "data", double), 1, 0);

@@ -1,0 +1,48 @@
+/* What the blocks of all cameras have in common: a thread fills frames, a step copies the newest into the output.
+ *
+ * An image is a port of width * height bytes, row by row from the top left, 0 black and 255 white: plain data like all
+ * other signals, so it can be wired, recorded and checked as they are. That costs one copy of each frame in the step;
+ * the wire itself copies nothing, and a step without a new frame none either. */
+#ifndef FLOTILLA_CAMERA_GRABBER_H
+#define FLOTILLA_CAMERA_GRABBER_H
+
+#include "frames.h"
+
+#include <flotilla/driver.h>
+
+enum { GRABBER_SIDE = 2048 }; /* largest width and height: 12 MiB of buffers at most */
+
+#define GRABBER_MEMBERS                                                                                                \
+    int64_t width, height;                                                                                             \
+    double timeout
+
+#define GRABBER_PARAMETERS(type)                                                                                       \
+    FL_PARAMETER(type, width, .fallback = "640", .min = 16, .max = GRABBER_SIDE, .unit = "pixel",                      \
+                 .summary = "of the image"),                                                                           \
+        FL_PARAMETER(type, height, .fallback = "480", .min = 16, .max = GRABBER_SIDE, .unit = "pixel",                 \
+                     .summary = "of the image"),                                                                       \
+        FL_PARAMETER(type, timeout, .fallback = "0.5", .min = 1e-6, .max = 1e6, .unit = "s",                           \
+                     .summary = "age at which an image is no longer good")
+
+struct grabber {
+    struct frames frames;
+    struct fl_driver *driver;
+    const void *parameters;
+    size_t bytes;
+    _Atomic bool connected; /* the thread's: the camera streams */
+    int64_t taken_ns;
+    uint32_t sequence;
+};
+
+/* Add the outputs image, flag, age and sequence. */
+int grabber_configure(struct fl_block *block, int64_t width, int64_t height);
+
+/* Allocate, and start the thread `run(driver, grabber)`, which talks to the camera until it shall return. */
+int grabber_start(struct fl_block *block, struct grabber *grabber, int64_t width, int64_t height,
+                  void (*run)(struct fl_driver *driver, void *grabber));
+
+void grabber_step(struct fl_block *block, struct grabber *grabber, double timeout);
+
+void grabber_stop(struct grabber *grabber);
+
+#endif
