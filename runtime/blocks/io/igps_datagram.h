@@ -1,6 +1,6 @@
 /* The datagram of the indoor positioning system, apart from sockets, so that it can be fed with anything. */
-#ifndef FLOTILLA_IO_IGPS_H
-#define FLOTILLA_IO_IGPS_H
+#ifndef FLOTILLA_IO_IGPS_DATAGRAM_H
+#define FLOTILLA_IO_IGPS_DATAGRAM_H
 
 #include <stdbool.h>
 #include <stddef.h>
