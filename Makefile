@@ -87,7 +87,7 @@ check-runtime: | setup-tests ## the runtime's unit tests, with AddressSanitizer 
 .PHONY: latency latency-accept boot-time hwcheck
 LATENCY = $(PYTHON) -m tests.latency
 # What is measured: the board's shipped system, or another kernel of it, or less of it, or a robot.
-measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--$(PLAN))
+measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--plan $(PLAN))
 latency: | setup-tests ## latency in virtual time against the accepted one [BOARD= KERNEL= PLAN=quick|disk]; or TARGET=ssh:robot3
 	$(Q)$(LATENCY) measure $(measured) $(if $(TARGET),--target $(TARGET))
 	$(if $(TARGET),,$(Q)$(LATENCY) compare $(measured))
@@ -95,7 +95,7 @@ latency: | setup-tests ## latency in virtual time against the accepted one [BOAR
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
 	$(Q)$(FLOTILLA) hwcheck --robot $(call need,ROBOT) $(if $(SECONDS),--seconds $(SECONDS))
 
-latency-accept: | setup-tests ## make the last latency run the accepted one
+latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and make that the accepted latency [BOARD= PLAN=]
 	$(Q)$(LATENCY) accept $(measured)
 
 boot-time: | setup-tests ## where a boot spends its time, in virtual time

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
+from typing import get_args
 
 from images.builder import inventory, paths
 from images.builder.errors import UserError
@@ -12,6 +12,7 @@ from images.builder.fleet import Board
 from tests.latency import boottime, gate, report, results, run, target
 
 REPORTS = paths.BUILD / "reports"
+KERNELS = ("lean", "debian")
 
 
 def _board(arguments: argparse.Namespace) -> Board:
@@ -42,39 +43,37 @@ def _report(_: argparse.Namespace) -> None:
     print(paths.shown(report.write(found, REPORTS)))
 
 
-def _last(arguments: argparse.Namespace) -> tuple[results.Results, Path]:
-    """The last run of a board, and its baseline."""
-    board = _board(arguments)
-    path = run.directory(board, arguments.plan) / "results.json"
-    if not path.exists():
-        raise UserError(f"{paths.shown(path)} is missing; measure first: make latency")
-    return results.read(path), gate.BASELINES / f"{run.name(board, arguments.plan)}.json"
-
-
 def _boot_time(arguments: argparse.Namespace) -> None:
     board = _board(arguments)
-    text = boottime.measure(board, paths.BUILD / "latency" / f"{run.name(board, 'standard')}-boot")
+    text = boottime.account(boottime.measure(board, paths.BUILD / "latency" / f"{run.name(board, 'standard')}-boot"))
     REPORTS.mkdir(parents=True, exist_ok=True)
     (REPORTS / f"boot-time-{run.name(board, 'standard')}.txt").write_text(text + "\n")
     print(text)
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    print(gate.check(*_last(arguments)))
+    board = _board(arguments)
+    path = run.directory(board, arguments.plan) / "results.json"
+    if not path.exists():
+        raise UserError(f"{paths.shown(path)} is missing; measure first: make latency")
+    print(gate.check(results.read(path), gate.baseline(board, arguments.plan)))
 
 
 def _accept(arguments: argparse.Namespace) -> None:
-    found, file = _last(arguments)
-    if found.plan == "disk":
-        raise UserError("--disk: has bounds, not a baseline: tests/latency/scenarios.py")
-    gate.accept(found, file)
-    print(f"{paths.shown(file)} is the last run; commit it with the reason for the difference")
+    """Anew, not the last run: so it is of the system as it is now, and one command does for both kernels."""
+    if arguments.plan == "disk":
+        raise UserError("--plan disk: has bounds, not a baseline: tests/latency/scenarios.py")
+    for kernel in [arguments.kernel] if arguments.kernel else KERNELS:
+        board = _board(argparse.Namespace(board=arguments.board, kernel=kernel))
+        file = gate.baseline(board, arguments.plan)
+        gate.accept(run.measure(board, arguments.plan, run.directory(board, arguments.plan)), file)
+        print(f"{paths.shown(file)} is what was measured; commit it with the reason for the difference")
 
 
 _COMMANDS = {
     "measure": (_measure, "measure a board's system in virtual time, and write the report"),
     "compare": (_compare, "compare the last run with the accepted one: exactly"),
-    "accept": (_accept, "make the last run the accepted one"),
+    "accept": (_accept, "measure, and make that the accepted run; both kernels, unless one is named"),
     "report": (_report, "write the report of all runs there are"),
     "boot-time": (_boot_time, "boot once in virtual time, and say where it goes"),
 }
@@ -86,14 +85,14 @@ def main() -> int:
     for name, (_, text) in _COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("--board", default="smartcoret3", help="name in the inventory (%(default)s)")
-        command.add_argument("--kernel", choices=("debian", "lean"), help="instead of the one the inventory names")
+        command.add_argument("--kernel", choices=KERNELS, help="instead of the one the inventory names")
         if name == "measure":
             command.add_argument("--target", metavar="ssh:ROBOT", help="a robot in real time, instead of virtual time")
-        plan = command.add_mutually_exclusive_group()
-        plan.add_argument(
-            "--quick", dest="plan", action="store_const", const="quick", default="standard", help="the short run"
-        )
-        plan.add_argument("--disk", dest="plan", action="store_const", const="disk", help="with a disk: bounded only")
+        default = "quick" if name == "accept" else "standard"
+        command.add_argument(
+            "--plan", choices=get_args(results.Plan), default=default,
+            help="standard, a minute each; quick, what every test run measures; disk, bounded only (%(default)s)",
+        )  # fmt: skip
     arguments = parser.parse_args()
     try:
         _COMMANDS[arguments.command][0](arguments)

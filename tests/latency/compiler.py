@@ -1,4 +1,4 @@
-"""The measurement's own program, as one static file."""
+"""The measurement's own programs, each as one static file."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from pathlib import Path
 from images.builder import toolchain
 from images.builder.fleet import Board
 
+SOURCES = ("serial_latency.c", "first_step.c")
 
-def compile_static(source: Path, board: Board) -> bytes:
-    """Compile a C program for a board by the locked compiler, so that every development computer measures the same."""
-    return toolchain.compile_static(
-        source, board.architecture, ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-pthread"]
-    )
+
+def programs(board: Board) -> dict[str, bytes]:
+    """All of them by name, by the locked compiler, so that every development computer measures the same."""
+    here = Path(__file__).parent
+    options = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-pthread"]
+    return {Path(name).stem: toolchain.compile_static(here / name, board.architecture, options) for name in SOURCES}

@@ -10,7 +10,9 @@ from pathlib import Path
 
 from images.builder import paths
 from images.builder.errors import UserError
-from tests.latency.results import Binding, Latency, Outcome, Results, read
+from images.builder.fleet import Board
+from tests.latency import run, trace
+from tests.latency.results import Latency, Outcome, Plan, Results, read
 from tests.latency.scenarios import SCENARIOS
 
 BASELINES = Path(__file__).parent / "baselines"
@@ -23,6 +25,11 @@ _MEANING = {
     "qemu": "another QEMU",
     "firmware": "another BIOS (package seabios)",
 }
+
+
+def baseline(board: Board, plan: Plan) -> Path:
+    """Where the accepted run is kept."""
+    return BASELINES / f"{run.name(board, plan)}.json"
 
 
 def compare(found: Results, baseline: Results) -> list[str]:
@@ -41,14 +48,24 @@ def compare(found: Results, baseline: Results) -> list[str]:
     return moved
 
 
-def causes(found: Binding, baseline: Binding) -> list[str]:
+def causes(found: Results, baseline: Results) -> list[str]:
     """What the two runs differ in besides their figures."""
-    before, after = baseline.model_dump(), found.model_dump()
-    return [
+    before, after = baseline.binding.model_dump(), found.binding.model_dump()
+    differing = [
         f"{name}: {_short(before[name])} → {_short(after[name])} ({meaning})"
         for name, meaning in _MEANING.items()
         if before[name] != after[name]
     ]
+    if (was := f"{baseline.release} {baseline.version}") != (now := f"{found.release} {found.version}"):
+        differing.append(f"uname: {was} → {now}")
+    return differing
+
+
+def traced(found: Results, baseline: Results) -> list[str]:
+    """What the kernel's trace says of the latest samples, where that is not what it said before."""
+    texts = {name: trace.cause(outcome.trace) for name, outcome in found.scenarios.items()}
+    before = {name: trace.cause(outcome.trace) for name, outcome in baseline.scenarios.items()}
+    return [f"{name}: {text}" for name, text in texts.items() if text and text != before.get(name)]
 
 
 def check(found: Results, file: Path) -> str:
@@ -59,13 +76,15 @@ def check(found: Results, file: Path) -> str:
         raise UserError(f"{paths.shown(file)} is missing: nothing to compare with; make it from this run: {ACCEPT}")
     baseline = read(file)
     moved = compare(found, baseline)
-    differing = causes(found.binding, baseline.binding)
+    differing = causes(found, baseline)
     if not moved:
         aside = f", although there is\n  {_lines(differing)}" if differing else ""
         return f"every figure is that of {paths.shown(file)}{aside}"
     likely = f"likely cause:\n  {_lines(differing)}" if differing else (
         "kernel, root, measurement, machine, QEMU and BIOS are the same: the run did not repeat, which is a defect"
     )  # fmt: skip
+    if named := traced(found, baseline):
+        likely += f"\nthe kernel's trace of the latest sample:\n  {_lines(named)}"
     raise UserError(
         f"latency is not that of {paths.shown(file)}:\n  {_lines(moved)}\n{likely}\n"
         f"`make latency` shows the distributions; if this is meant: {ACCEPT}"

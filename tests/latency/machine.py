@@ -7,6 +7,7 @@ code that never has to be thrown away (`tb-size`), and outputs that are files, s
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -14,19 +15,56 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from images.builder import paths, progress, qemu
+from images.builder import cache, paths, pool, progress, qemu, tools
 from images.builder.boot import DIE_WITH_PARENT
 from images.builder.errors import UserError
 from images.builder.fleet import Board
+from images.builder.lock import Lock, read_lock
 
 INSTRUCTION_NS = 8
 """Virtual time of one instruction, `-icount shift=3`: 125 million instructions per second."""
+
+
+_PROGRAMS = {"i386": "usr/libexec/qemu-system-i386", "x86_64": "usr/bin/qemu-system-x86_64"}
+"""By the board's `qemu.system`; Debian's usr/bin/qemu-system-i386 is a script that starts the former."""
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """QEMU as the lock `emulator` has it, run from where it is unpacked: the same one on every computer."""
+
+    lock: Lock
+    tree: Path
+
+    def command(self, board: Board) -> list[str]:
+        """What runs it, with its own firmware."""
+        shared = self.tree / "usr/share"
+        argv = tools.command(self.tree, _PROGRAMS[board.qemu.system])
+        return [*argv, "-L", str(shared / "qemu"), "-L", str(shared / "seabios")]
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Debian's QEMU loads parts of itself, the emulation of processors among them."""
+        return {**os.environ, "QEMU_MODULE_DIR": str(self.tree / "usr/lib/x86_64-linux-gnu/qemu")}
+
+    def version(self, name: str) -> str:
+        """Of one of its packages."""
+        return next(package.version for package in self.lock.packages if package.name == name)
+
+
+def emulator() -> Emulator:
+    """The locked QEMU, unpacked; downloaded where the pool lacks it."""
+    lock = read_lock("emulator")
+    with cache.exclusive():
+        pool.fill([lock])
+        return Emulator(lock, tools.tree(lock))
 
 
 @dataclass(frozen=True)
 class Machine:
     """A board, and what it boots."""
 
+    emulator: Emulator
     board: Board
     kernel: Path
     initrd: Path
@@ -40,33 +78,14 @@ class Machine:
 
         `timeout_s`: seconds of the host's clock.
         """
-        results, console = directory / "results", directory / "console.log"
-        results.unlink(missing_ok=True)
-        argv = self.command_line(console, results)
-        (directory / "qemu.command").write_text(shlex.join(argv) + "\n")
-        progress.command(argv)
-        try:
-            done = subprocess.run(
-                [*DIE_WITH_PARENT, *argv],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                timeout=timeout_s,
-            )
-        except subprocess.TimeoutExpired:
-            raise UserError(f"the guest did not end within {timeout_s:g} s; {_tail(console)}") from None
-        if done.returncode:
-            raise UserError(f"QEMU ended with status {done.returncode}: {done.stderr.strip()}")
-        content = results.read_bytes()
-        if not content:
-            raise UserError(f"the guest ended without results; {_tail(console)}")
-        return content
+        argv = self.command_line(directory / "console.log", directory / "results")
+        return execute(self.emulator, argv, directory, timeout_s)
 
     def command_line(self, console: Path, results: Path) -> list[str]:
         """The whole command; all but the results' connector and the console leads nowhere."""
         board = self.board
-        argv = [qemu.program(board), "-name", "latency", "-nodefaults", "-no-user-config", "-display", "none"]
+        argv = self.emulator.command(board)
+        argv += ["-name", "latency", "-nodefaults", "-no-user-config", "-display", "none"]
         argv += ["-machine", f"{board.qemu.machine},usb=off,hpet=off", "-cpu", board.qemu.cpu]
         argv += ["-m", str(board.qemu.memory_mib), "-accel", "tcg,thread=single,tb-size=1024"]
         argv += ["-icount", "shift=3,sleep=off", "-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"]
@@ -86,25 +105,47 @@ class Machine:
         return argv
 
 
+def card_command_line(emulator: Emulator, board: Board, card: Path, console: Path, results: Path) -> list[str]:
+    """The machine that boots a card through its own boot loader. Its figures do not repeat: it has a disk.
+
+    While the guest waits for the disk, the clock goes as the host's: skipping that time would count it many times over.
+    """
+    last = list(qemu.port_ids(board))[-1]
+    options = qemu.Options(console=_file(console), ports={last: _file(results)}, reboot=False, virtual_time=True)
+    argv = qemu.command_line(board, card, options)[1:]
+    return [*emulator.command(board), *(word.replace(",sleep=off", ",sleep=on") for word in argv)]
+
+
+def execute(emulator: Emulator, argv: list[str], directory: Path, timeout_s: float) -> bytes:
+    """Run a guest until it reboots; what it wrote to `results` in `directory`, where `console.log` stays, too."""
+    results, console = directory / "results", directory / "console.log"
+    results.unlink(missing_ok=True)
+    (directory / "qemu.command").write_text(shlex.join(argv) + "\n")
+    progress.command(argv)
+    try:
+        done = subprocess.run(
+            [*DIE_WITH_PARENT, *argv],
+            env=emulator.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=timeout_s,
+        )
+    except subprocess.TimeoutExpired:
+        raise UserError(f"the guest did not end within {timeout_s:g} s; {_tail(console)}") from None
+    if done.returncode:
+        raise UserError(f"QEMU ended with status {done.returncode}: {done.stderr.strip()}")
+    content = results.read_bytes()
+    if not content:
+        raise UserError(f"the guest ended without results; {_tail(console)}")
+    return content
+
+
 def results_tty(board: Board) -> str:
-    """Kernel name of the connector that `run` listens to: the last one, which nothing else is plugged into."""
+    """Kernel name of the connector whose output is `results`: the last one, which nothing else is plugged into."""
     last = list(qemu.port_ids(board))[-1]
     return board.ports[last].tty
-
-
-def version(board: Board) -> str:
-    """QEMU's version, package revision included: `7.2.22 (Debian 1:7.2+dfsg-7+deb12u18)`."""
-    done = subprocess.run([qemu.program(board), "--version"], capture_output=True, text=True, check=True)
-    return done.stdout.splitlines()[0].partition(" version ")[2]
-
-
-def firmware(board: Board) -> Path:
-    """The BIOS that QEMU loads: it has a version of its own, and runs before the kernel."""
-    done = subprocess.run([qemu.program(board), "-L", "help"], capture_output=True, text=True, check=True)
-    for directory in done.stdout.splitlines():
-        if (found := Path(directory) / "bios-256k.bin").exists():
-            return found
-    raise UserError(f"QEMU's BIOS bios-256k.bin is in none of {', '.join(done.stdout.split())}; install seabios")
 
 
 def without_paths(argv: Sequence[str]) -> str:

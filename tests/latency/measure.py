@@ -24,6 +24,9 @@ from typing import Any
 WARM_UP_S = 1.0
 """From the start of a load to that of a measurement, and after its end: no event says that a load is complete."""
 
+FIRST_STEP = Path("/run/first-step")
+"""What `first_step` wrote, where its unit is in the system."""
+
 _END_S = 10.0
 """For a load to end by itself; then it is killed."""
 
@@ -98,14 +101,12 @@ def boot() -> dict[str, Any]:
         ["systemctl", "list-units", "--failed", "--plain", "--no-legend"], capture_output=True, text=True, check=True
     ).stdout
     stamps = dict(line.split("=", 1) for line in shown.splitlines() if "TimestampMonotonic=" in line)
-    step = subprocess.run(
-        ["systemctl", "show", "-P", "ExecMainExitTimestampMonotonic", "first-step.service"],
-        capture_output=True, text=True, check=True,
-    ).stdout  # fmt: skip
+    step = json.loads(FIRST_STEP.read_text()) if FIRST_STEP.exists() else {}
     return {
         "userspace_us": int(stamps["UserspaceTimestampMonotonic"]),
         "finished_us": int(stamps["FinishTimestampMonotonic"]),
-        "first_step_us": int(step or 0),
+        "before_kernel_us": step.get("power_on_us", 0) - step.get("monotonic_us", 0),
+        "first_step_us": step.get("monotonic_us", 0),
         "failed_units": [line.split()[0] for line in failed.splitlines()],
     }
 

@@ -11,6 +11,7 @@ from typing import get_args
 
 import jinja2
 
+from tests.latency import trace
 from tests.latency.results import Latency, Outcome, Plan, Results
 from tests.latency.run import VIRTUAL
 from tests.latency.scenarios import SCENARIOS
@@ -128,7 +129,7 @@ def render(runs: Sequence[Results]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["zip"] = zip
+    environment.filters |= {"zip": zip, "cause": trace.cause}
     return environment.get_template("report.html.j2").render(
         runs=[(label(run), run) for run in runs], charts=charts(runs), rows=rows(runs)
     )

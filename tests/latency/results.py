@@ -85,10 +85,12 @@ class Outcome(_Model):
 class Boot(_Model):
     """Virtual time since the kernel's clock started."""
 
+    before_kernel_us: int
+    """Before that clock: BIOS, and the kernel that unpacks itself."""
     userspace_us: int
-    """The first program of the root runs."""
+    """systemd runs."""
     first_step_us: int
-    """A service that is started like any other had its first period as a SCHED_FIFO thread."""
+    """A service that is ordered as early as a control task had its first period as a SCHED_FIFO thread."""
     finished_us: int
     """Everything that starts at boot has started."""
     failed_units: list[str]
@@ -106,9 +108,9 @@ class Binding(_Model):
     machine: str
     """QEMU's command line, without paths."""
     qemu: str
-    """QEMU's version."""
+    """Version of QEMU, package revision included."""
     firmware: str
-    """SHA-256 of the BIOS."""
+    """Version of the BIOS."""
 
 
 Plan = Literal["standard", "quick", "disk"]

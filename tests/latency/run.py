@@ -7,7 +7,8 @@ from typing import Any
 
 from images.builder import cache, paths, progress
 from images.builder.fleet import Board
-from tests.latency import compiler, machine, results, subject
+from tests.latency import machine, results, subject
+from tests.latency.controls import NOTHING, Control
 from tests.latency.results import Plan, Results
 from tests.latency.scenarios import SCENARIOS, Scenario
 
@@ -36,11 +37,11 @@ def planned(plan: Plan) -> list[Scenario]:
     return [scenario for scenario in SCENARIOS if not scenario.limit_us and (plan == "standard" or scenario.quick)]
 
 
-def measure(board: Board, plan: Plan, out: Path) -> Results:
-    """Measure a board's system; `results.json` is in `out` when it is done."""
-    measured = subject.build(board)
+def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING) -> Results:
+    """Measure a board's system; `results.json` is in `out` when it is done. `control`: what is wrong with it."""
+    measured = subject.build(board, control.kernel)
+    emulator = machine.emulator()
     out.mkdir(parents=True, exist_ok=True)
-    program = compiler.compile_static(subject.HERE / "serial_latency.c", board)
     boots: dict[tuple[str, ...], list[Scenario]] = {}
     for scenario in planned(plan):
         boots.setdefault(scenario.without, []).append(scenario)
@@ -48,11 +49,11 @@ def measure(board: Board, plan: Plan, out: Path) -> Results:
     inputs, commands = [], []
     for without, scenarios in boots.items():
         initrd = out / "initrd.img"
-        todo = {"scenarios": [scenario.describe(SECONDS[plan]) for scenario in scenarios]}
-        programs = {"serial_latency": program}
-        inputs.append(subject.write_initrd(measured, initrd, todo, programs, machine.results_tty(board)))
+        described = [scenario.describe(SECONDS[plan], control.load) for scenario in scenarios]
+        todo = {"scenarios": described, "commands": control.commands(subject.DIRECTORY)}
+        inputs.append(subject.write_initrd(measured, initrd, todo, control.files(board, subject.DIRECTORY)))
         disk = _empty_disk(out / "disk.img") if plan == "disk" else None
-        guest = machine.Machine(board, measured.kernel, initrd, measured.arguments(without), disk)
+        guest = machine.Machine(emulator, board, measured.kernel, initrd, measured.arguments(without), disk)
         commands.append(machine.without_paths(guest.command_line(Path("/c"), Path("/r"))))
         seconds = sum(SECONDS[plan] * scenario.share for scenario in scenarios)
         title = " without ".join([f"latency of {name(board, plan)}", *without])
@@ -65,8 +66,8 @@ def measure(board: Board, plan: Plan, out: Path) -> Results:
         **measured.hashes(),
         measurement=cache.digest(*inputs),
         machine=cache.digest(*commands),
-        qemu=machine.version(board),
-        firmware=cache.digest(machine.firmware(board).read_bytes()),
+        qemu=emulator.version("qemu-system-x86"),
+        firmware=emulator.version("seabios"),
     )
     found = results_of(board, plan, binding, documents, planned(plan), VIRTUAL)
     (out / "results.json").write_text(found.text())

@@ -107,14 +107,14 @@ class Scenario:
     def samples(self, seconds: float) -> int:
         return max(1, round(seconds * self.share * 1000 / self.meter.period_ms))
 
-    def describe(self, seconds: float) -> dict[str, Any]:
-        """The scenario as `measure.py` reads it."""
+    def describe(self, seconds: float, planted: tuple[Command, ...] = ()) -> dict[str, Any]:
+        """The scenario as `measure.py` reads it; `planted`: more to run beside it."""
         samples = self.samples(seconds)
         needs = [word for load in self.loads for word in load if word.startswith("/dev/")] + list(self.meter.needs)
         return {
             "name": self.name,
             "meter": [word.format(samples=samples) for word in self.meter.command],
-            "loads": [list(load) for load in self.loads],
+            "loads": [list(load) for load in (*planted, *self.loads)],
             "needs": needs,
             "timeout_s": 60 + 10 * samples * self.meter.period_ms / 1000,
         }
@@ -134,7 +134,14 @@ SCENARIOS = (
     Scenario("serial", "a serial port at 115200 Bd", CYCLICTEST, SERIAL),
     Scenario("everything", "memory, messages, network and files at once", CYCLICTEST, EVERYTHING),
     Scenario("timerlat", "idle, by the kernel's tracer", TIMERLAT, share=1 / 6),
-    Scenario("timerlat-everything", "everything at once, by the kernel's tracer", TIMERLAT, EVERYTHING, share=1 / 6),
+    Scenario(
+        "timerlat-everything",
+        "everything at once, by the kernel's tracer",
+        TIMERLAT,
+        EVERYTHING,
+        share=1 / 6,
+        quick=True,
+    ),
     Scenario("uart-own", "port with its own interrupt, idle", UART_OWN, share=_SHORT, quick=True),
     Scenario("uart-own-cpu", "port with its own interrupt, computing", UART_OWN, CPU, share=_SHORT),
     Scenario("uart-own-everything", "port with its own interrupt, everything", UART_OWN, EVERYTHING, share=_SHORT),

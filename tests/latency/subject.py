@@ -13,6 +13,7 @@ import json
 import stat
 import struct
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path, PurePosixPath
@@ -21,10 +22,11 @@ from unittest import mock
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from images.builder import cache, card, filesystem, host, identity, initramfs, namespace, paths
+from images.builder import cache, card, filesystem, host, identity, initramfs, kernel, namespace, paths
 from images.builder.build import BoardBuild, board_build
 from images.builder.filesystem import Node
 from images.builder.fleet import Board, Device, Fleet, Network, Robot
+from tests.latency import compiler, machine
 
 HERE = Path(__file__).parent
 MODULES = ("loop", "squashfs", "overlay", "crc32c_generic", "ext4")
@@ -39,22 +41,30 @@ SuccessAction=reboot-immediate
 FailureAction=reboot-immediate
 
 [Service]
-ExecStart=/usr/bin/python3 /run/latency/measure.py /run/latency/plan.json /dev/{tty}
+ExecStart=/usr/bin/python3 {directory}/measure.py {directory}/plan.json /dev/{tty}
 StandardError=tty
 TTYPath=/dev/{console}
 """
-_LINKS = {f"bin/{name}": "busybox" for name in _APPLETS.split()} | {
-    "run/systemd/system/multi-user.target.wants/latency.service": "../latency.service",
-    "run/systemd/system/multi-user.target.wants/first-step.service": "../first-step.service",
-    "run/systemd/system/flotilla-mark-good.service": "/dev/null",  # it looks for the card's boot partition
-}
 FIRST_STEP = """[Unit]
 Description=First period of a real-time thread
+DefaultDependencies=no
 
 [Service]
-Type=oneshot
-ExecStart=/usr/bin/cyclictest -q -m -p 90 -i 1000 -l 1
+Nice=-20
+CPUSchedulingPolicy=fifo
+CPUSchedulingPriority=90
+StandardOutput=null
+StandardError=null
+ExecStart={directory}/first_step /run/first-step
 """
+"""Ordered as a control task may be at the earliest: ARCHITECTURE.md says what it finds then."""
+UNITS = {"latency": (UNIT, "multi-user.target"), "first-step": (FIRST_STEP, "sysinit.target")}
+"""With the target that wants them."""
+DIRECTORY = PurePosixPath("/run/latency")
+"""Of the measurement's own files in the guest."""
+_LINKS = {f"bin/{name}": "busybox" for name in _APPLETS.split()} | {
+    "run/systemd/system/flotilla-mark-good.service": "/dev/null",  # it looks for the card's boot partition
+}
 _ARGUMENTS = ("flotilla.slot=A", "nokaslr", "norandmaps", "random.trust_cpu=off")
 """What GRUB adds, and what a run needs to repeat."""
 
@@ -64,14 +74,11 @@ class Subject:
     """A board's system as it is shipped, by its parts."""
 
     made: BoardBuild
+    kernel: Path
 
     @property
     def board(self) -> Board:
         return self.made.board
-
-    @property
-    def kernel(self) -> Path:
-        return self.made.root / "vmlinuz"
 
     @property
     def squashfs(self) -> Path:
@@ -89,29 +96,48 @@ class Subject:
         }
 
 
-def build(board: Board) -> Subject:
-    """The board's kernel and root, from the cache where nothing changed."""
+def build(board: Board, other_kernel: str | None = None) -> Subject:
+    """The board's kernel and root, from the cache where nothing changed; or another kernel of kernels.yml below it."""
     host.check()
     namespace.check()
     with cache.exclusive():
-        return Subject(board_build(board))
+        made = board_build(board)
+        return Subject(made, kernel.build(other_kernel).image if other_kernel else made.root / "vmlinuz")
 
 
-def write_initrd(subject: Subject, out: Path, plan: dict[str, Any], programs: dict[str, bytes], tty: str) -> str:
+def measurement(board: Board, plan: dict[str, Any]) -> dict[str, tuple[int, bytes]]:
+    """Mode and content of the measurement's own files, by name. `plan`: what `measure.py` reads."""
+    files = {name: (0o755, (HERE / name).read_bytes()) for name in ("measure.py", "timerlat.py")}
+    files |= {name: (0o755, content) for name, content in compiler.programs(board).items()}
+    files["plan.json"] = (0o644, json.dumps(plan, sort_keys=True).encode())
+    return files
+
+
+def units(board: Board, directory: PurePosixPath) -> dict[str, bytes]:
+    """The measurement's units and the drop-ins that start them, by their names below `systemd/system`."""
+    tty, console = machine.results_tty(board), board.console.tty
+    files = {}
+    for name, (text, target) in UNITS.items():
+        files[f"{name}.service"] = text.format(directory=directory, tty=tty, console=console).encode()
+        files[f"{target}.d/{name}.conf"] = f"[Unit]\nWants={name}.service\n".encode()
+    return files
+
+
+def write_initrd(subject: Subject, out: Path, plan: dict[str, Any], more: Mapping[str, bytes]) -> str:
     """Write the archive that QEMU loads beside the kernel; SHA-256 of all in it but the root.
 
-    `plan`: what `measure.py` reads. `programs`: executables for `/run/latency`. `tty`: where the results go.
+    `plan`: what `measure.py` reads. `more`: further files, by their path.
     """
-    unit = UNIT.format(tty=tty, console=subject.board.console.tty)
-    files: dict[str, tuple[int, bytes]] = {
+    absolute = {str(DIRECTORY / name): file for name, file in measurement(subject.board, plan).items()}
+    absolute |= {path: (0o644, content) for path, content in more.items()}
+    absolute |= {
+        f"/run/systemd/system/{name}": (0o644, content) for name, content in units(subject.board, DIRECTORY).items()
+    }
+    files = {path.removeprefix("/"): file for path, file in absolute.items()}
+    files |= {
         "init": (0o755, (HERE / "init").read_bytes()),
-        **{f"run/latency/{name}": (0o755, (HERE / name).read_bytes()) for name in ("measure.py", "timerlat.py")},
-        "run/latency/plan.json": (0o644, json.dumps(plan, sort_keys=True).encode()),
-        "run/systemd/system/latency.service": (0o644, unit.encode()),
-        "run/systemd/system/first-step.service": (0o644, FIRST_STEP.encode()),
         "root.squashfs": (0o644, subject.squashfs.read_bytes()),
     }
-    files |= {f"run/latency/{name}": (0o755, content) for name, content in programs.items()}
     with tempfile.TemporaryDirectory(dir=out.parent) as temporary:
         directory = Path(temporary)
         files |= _from_root(subject, directory / "root")
@@ -177,16 +203,20 @@ def tested_ports(board: Board) -> dict[str, str]:
     return {"uart_own": own[0]} | ({"uart_shared": shared[0]} if shared else {})
 
 
-def _data_partition(subject: Subject, image: Path) -> bytes:
-    fleet, measured = robot(subject.board)
-    keys = image.with_name("keys")
+def identity_nodes(board: Board, keys: Path) -> list[Node]:
+    """The measured robot's identity, with keys that are made in the directory `keys`."""
+    fleet, measured = robot(board)
     keys.mkdir()
     for name in (f"{measured.name}_ed25519", "operator_ed25519"):
         private, public = ssh_key(name)
         (keys / name).write_text(private)
         (keys / f"{name}.pub").write_text(public)
     with mock.patch.object(paths, "KEYS", keys):
-        nodes = identity.nodes(fleet, measured)
+        return identity.nodes(fleet, measured)
+
+
+def _data_partition(subject: Subject, image: Path) -> bytes:
+    nodes = identity_nodes(subject.board, image.with_name("keys"))
     # The card is in memory: it neither grows nor needs to.
     nodes += [Node(PurePosixPath(path)) for path in ("/var/lib", "/var/lib/flotilla")]
     nodes.append(Node(PurePosixPath("/var/lib/flotilla/grown"), b"", 0o644))

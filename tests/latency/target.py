@@ -40,7 +40,7 @@ def measure(robot: Robot, board: Board, shell: Ssh, plan: results.Plan, out: Pat
     scenarios = [scenario for scenario in run.planned(plan) if not scenario.without]  # those need a boot of their own
     described = [scenario.describe(run.SECONDS[plan]) for scenario in scenarios]
     files = {name: (subject.HERE / name).read_bytes() for name in ("measure.py", "timerlat.py")}
-    files["serial_latency"] = compiler.compile_static(subject.HERE / "serial_latency.c", board)
+    files["serial_latency"] = compiler.programs(board)["serial_latency"]
     files["plan.json"] = json.dumps({"scenarios": described}).encode()
     free = {name: board.ports[port].tty for name, port in _free_ports(robot, board).items()}
     shell.run(["sudo", "install", "-d", "-o", "robot", _DIRECTORY, "/dev/robot"])

@@ -13,7 +13,8 @@ import pytest
 
 from images.builder import inventory, paths
 from images.builder.errors import UserError
-from tests.latency import boottime, gate, machine, report, results, run, subject, target, timerlat
+from images.builder.lock import read_lock
+from tests.latency import boottime, controls, gate, machine, report, results, run, subject, target, timerlat, trace
 from tests.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
 from tests.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
 
@@ -27,10 +28,10 @@ def made(**changes: Any) -> Results:
     binding = dict.fromkeys(Binding.model_fields, "a" * 64) | changes
     activity = Activity(busy_percent=10, interrupts_per_s=100, context_switches_per_s=200)
     idle = Outcome(title="idle", latencies={"wake-up": Latency.of(histogram)}, activity=activity)
+    boot = Boot(before_kernel_us=1, userspace_us=1, first_step_us=2, finished_us=3, failed_units=[])
     return Results(
         board="board", kernel="debian", plan="standard", where=run.VIRTUAL, release="6.1", version="#1",
-        binding=Binding(**binding), boot=Boot(userspace_us=1, first_step_us=2, finished_us=3, failed_units=[]),
-        scenarios={"idle": idle},
+        binding=Binding(**binding), boot=boot, scenarios={"idle": idle},
     )  # fmt: skip
 
 
@@ -125,6 +126,47 @@ def test_timerlat_histograms_and_the_cause_of_the_worst() -> None:
     assert found["trace"][-1].endswith("29900 ns")
 
 
+FAULT = """  irq_test-9    [000] d.h1.  54.001: #1   context    irq timer_latency    251000 ns
+  irq_test-9    [000] dNh2.  54.002: irq_noise: local_timer:236 start 54.001 duration 80000 ns
+  irq_test-9    [000] d..3.  54.002: thread_noise: irq_test:9 start 54.000 duration 301000 ns
+  timerlat/0-8  [000] .....  54.003: #1   context thread timer_latency    382700 ns
+  timerlat/0-8  [000] .....  54.003: <stack trace>
+ => timerlat_irq
+ => sysvec_apic_timer_interrupt
+ => handle_exception_return
+ => execute_preemptirqtest
+ => preemptirq_delay_run
+ => kthread
+  <idle>-0      [000] d.h1.  54.004: #2   context    irq timer_latency       900 ns
+  timerlat/0-8  [000] .....  54.005: #2   context thread timer_latency     11700 ns
+"""
+
+
+def test_functions_belong_to_the_sample_before_them() -> None:
+    found = timerlat.summary(FAULT.splitlines(), 2)
+    assert [line for line in found["trace"] if line.startswith("=> ")][-1] == "=> kthread"
+    assert not any("#2" in line for line in found["trace"])
+    earlier = timerlat.summary(TRACE.splitlines() + FAULT.splitlines(), 2)
+    assert not any(line.startswith("=> ") for line in earlier["trace"]), "of a sample that is not shown"
+
+
+def test_gathering_functions_makes_no_sample_the_latest() -> None:
+    deep = FAULT.replace("80000 ns", "340000 ns").replace("382700 ns", "390000 ns") + FAULT.replace("#1 ", "#2 ")
+    assert "#1" in timerlat.summary(deep.splitlines(), 9)["trace"][0]
+    assert "#2" in timerlat.summary(deep.splitlines(), 9, functions=True)["trace"][0]
+
+
+def test_cause_in_words() -> None:
+    assert trace.cause(timerlat.summary(FAULT.splitlines(), 2)["trace"]) == (
+        "302 µs late; the timer found irq_test in execute_preemptirqtest < preemptirq_delay_run < kthread; "
+        "longest before the thread: thread irq_test, 301 µs"
+    )
+    assert trace.cause(timerlat.summary(TRACE.splitlines(), 2)["trace"]) == (
+        "29 µs late; the timer found <idle>; longest before the thread: irq local_timer, 8 µs"
+    )
+    assert trace.cause([]) == ""
+
+
 # The gate
 
 
@@ -170,6 +212,18 @@ def test_gate(tmp_path: Path) -> None:
     assert "make latency-accept" in message
     with pytest.raises(UserError, match="the run did not repeat, which is a defect"):
         gate.check(made(histogram={23: 99, 46: 1}), file)
+
+
+def test_gate_tells_what_the_trace_says_and_what_kernel_it_was(tmp_path: Path) -> None:
+    file = tmp_path / "baseline.json"
+    gate.accept(made(), file)
+    lines = timerlat.summary(FAULT.splitlines(), 2)["trace"]
+    late = made(histogram={302: 1}).scenarios["idle"].model_copy(update={"trace": lines})
+    faulty = made(histogram={302: 1}).model_copy(update={"scenarios": {"idle": late}, "version": "#2"})
+    with pytest.raises(UserError) as caught:
+        gate.check(faulty, file)
+    assert "idle: 302 µs late; the timer found irq_test in execute_preemptirqtest" in str(caught.value)
+    assert "uname: 6.1 #1 → 6.1 #2" in str(caught.value)
 
 
 def test_with_a_disk_there_are_bounds_only(tmp_path: Path) -> None:
@@ -248,11 +302,26 @@ DMESG = """[    0.000000] Linux version 6.1
 
 def test_boot_account() -> None:
     board = inventory.load_fleet().boards["smartcoret3"]
-    boot = {"userspace_us": 2_290_000, "finished_us": 9_000_000, "first_step_us": 7_000_000}
-    commands = {"dmesg": DMESG, "blame": "2.000s ssh.service\n", "chain": "graphical.target @9s\n"}
-    account = boottime.account(board, {"release": "6.1", "boot": boot, "commands": commands})
-    assert "   2.290 kernel" in account
-    assert "   6.710 user space" in account
+    boot = {"before_kernel_us": 300_000, "userspace_us": 2_290_000, "first_step_us": 3_500_000}
+    show = "".join(
+        f"{name}TimestampMonotonic={us}\n"
+        for name, us in {
+            "Userspace": 2_500_000, "GeneratorsStart": 2_800_000, "GeneratorsFinish": 2_900_000,
+            "UnitsLoadFinish": 3_200_000, "Finish": 9_000_000,
+        }.items()
+    )  # fmt: skip
+    commands = {"dmesg": DMESG, "show": show, "blame": "2.000s ssh.service\n", "chain": "graphical.target @9s\n"}
+    memory = {"boot": boot, "commands": commands}
+    card = {"release": "6.1", "boot": boot | {"before_kernel_us": 2_000_000}, "commands": commands}
+    boots = boottime.Boots(board, card, memory)
+    assert boots.first_step_s == pytest.approx(3.8)
+    account = boottime.account(boots)
+    assert "3.800 from the boot loader's end" in account
+    assert "5.500 from power on" in account
+    assert "   2.300 kernel" in account
+    assert "   0.200 preinit" in account
+    assert "   0.300 until the first SCHED_FIFO period" in account
+    assert "   5.500 until everything has started" in account
     assert "   1.500 populate_rootfs+0x0/0x30" in account
     assert "   1.750 Freeing initrd memory" in account
     assert "Run /init" not in account, "that was after the kernel's part"
@@ -271,6 +340,17 @@ def test_scenarios_are_well_formed() -> None:
         assert "{samples}" not in described
         assert scenario.samples(60) >= 1000, f"{scenario.name}: too few samples for its percentiles"
     assert [*run.planned("standard"), *run.planned("disk")] == list(SCENARIOS)
+
+
+def test_a_planted_fault_is_loaded_before_and_provoked_beside_every_scenario() -> None:
+    planted = controls.Control(delay="irq")
+    loads = IDLE.describe(60, planted.load)["loads"]
+    assert len(loads) == 1
+    assert "preemptirq_delay_test/trigger" in loads[0][-1]
+    (command,) = planted.commands(subject.DIRECTORY).values()
+    assert command[:2] == ["insmod", "/run/latency/preemptirq_delay_test.ko"]
+    assert IDLE.describe(60, controls.NOTHING.load) == IDLE.describe(60)
+    assert not controls.NOTHING.commands(subject.DIRECTORY)
 
 
 def test_modules_load_in_order_of_their_needs() -> None:
@@ -293,18 +373,20 @@ def test_key_is_one_that_openssh_reads(tmp_path: Path) -> None:
 
 def test_machine_is_the_board_in_virtual_time(tmp_path: Path) -> None:
     board = inventory.load_fleet().boards["smartcoret3"]
-    guest = machine.Machine(board, tmp_path / "vmlinuz", tmp_path / "initrd.img", ("quiet",))
+    qemu = machine.Emulator(read_lock("emulator"), tmp_path / "tree")
+    guest = machine.Machine(qemu, board, tmp_path / "vmlinuz", tmp_path / "initrd.img", ("quiet",))
     argv = guest.command_line(tmp_path / "console", tmp_path / "results")
     assert {"-nodefaults", "shift=3,sleep=off", f"{board.qemu.machine},usb=off,hpet=off"} <= set(argv)
     assert f"file,id=port11,path={tmp_path}/results" in argv
     assert machine.results_tty(board) == "ttyS11"
     assert [argv[at + 1] for at, word in enumerate(argv) if word == "-device"][1:] == board.qemu.devices
-    disk = machine.Machine(board, tmp_path, tmp_path, (), tmp_path / "disk").command_line(tmp_path, tmp_path)
+    assert argv[0].startswith(str(tmp_path / "tree")), "not this computer's QEMU"
+    disk = machine.Machine(qemu, board, tmp_path, tmp_path, (), tmp_path / "disk").command_line(tmp_path, tmp_path)
     assert "ide-hd,drive=disk,bus=ide.0,unit=0" in disk
     assert str(tmp_path) not in machine.without_paths(disk)
     shown = machine.without_paths(argv)
     assert str(tmp_path) not in shown
-    assert "/" not in shown.replace("/qemu-system", ""), f"a path is left in {shown}"
+    assert "/" not in shown, f"a path is left in {shown}"
 
 
 def test_kernel_command_line_is_the_shipped_one() -> None:
@@ -315,7 +397,7 @@ def test_kernel_command_line_is_the_shipped_one() -> None:
     shipped = card.kernel_arguments(board)
     nothing: Any = None
     made = BoardBuild(board, nothing, nothing, nothing, Path(), Path(), Path())
-    measured = subject.Subject(made)
+    measured = subject.Subject(made, Path())
     assert list(measured.arguments()[: len(shipped)]) == shipped
     assert "irqpoll" in measured.arguments()
     assert "irqpoll" not in measured.arguments(without=("irqpoll",))
