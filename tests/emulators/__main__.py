@@ -1,0 +1,56 @@
+"""Emulate a serial device until interrupted: python -m tests.emulators dsp3000 [--format words] [--corrupt 0.1] ..."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import threading
+from pathlib import Path
+
+from tests.emulators.dsp3000 import Dsp3000
+from tests.emulators.micromag3 import MicroMag3
+from tests.emulators.oceanserver import OceanServer
+from tests.emulators.serial_line import Device, Faults, Pty, SerialLine, Stream
+from tests.emulators.urg import Urg
+
+
+def device(options: argparse.Namespace) -> Device:
+    match options.device:
+        case "dsp3000":
+            return Dsp3000(lambda seconds: 10 * math.sin(seconds), options.format, deaf=options.deaf, seed=options.seed)
+        case "micromag3":
+            return MicroMag3(lambda seconds: 10 * seconds % 360, sums=options.sums, seed=options.seed)
+        case "oceanserver":
+            return OceanServer()
+    return Urg(lambda step, seconds: 1000 + 500 * (step // 100 % 2), old=options.old, seed=options.seed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.emulators", description=__doc__)
+    parser.add_argument("device", choices=["dsp3000", "micromag3", "oceanserver", "urg"])
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--link", type=Path, help="path of the pseudo terminal; else one is made up")
+    where.add_argument("--connect", help="HOST:PORT or Unix socket instead, QEMU's chardev for one")
+    parser.add_argument("--seed", type=int, default=0)
+    for name in ("garbage", "half", "corrupt"):
+        parser.add_argument(f"--{name}", type=float, default=0, help="share of messages")
+    parser.add_argument("--silence", action="store_true")
+    parser.add_argument("--burst", type=int, default=1, help="messages that leave at once")
+    parser.add_argument("--baud", type=int, help="a wrong rate")
+    parser.add_argument("--format", choices=["text", "words"], default="text", help="of the gyro")
+    parser.add_argument("--deaf", type=float, default=0.2, help="share of commands that the gyro misses")
+    parser.add_argument("--sums", choices=["xor", "unknown"], default="xor", help="checksums of the magnetometer")
+    parser.add_argument("--old", action="store_true", help="the scanner has to be switched to SCIP 2.0")
+    options = parser.parse_args()
+    faults = Faults(options.garbage, options.half, options.corrupt, options.silence, options.burst, options.baud)
+    endpoint = Stream(options.connect) if options.connect else Pty(options.link)
+    with SerialLine(device(options), endpoint, faults=faults, seed=options.seed) as line:
+        print(line.path, flush=True)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            return
+
+
+if __name__ == "__main__":
+    main()
