@@ -316,7 +316,8 @@ def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
     own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
     return cache.digest(
         *(lock.digest for lock in locks), *own_kernel, runtime.key(board.architecture), paths.OVERLAY,
-        images / "rootfs", images / "builder", images / "grub.cfg.j2", paths.PROJECT / "requirements.lock", board.model_dump_json(), *identity,
+        images / "rootfs", images / "builder", images / "grub.cfg.j2", paths.PROJECT / "requirements.lock",
+        board.model_dump_json(), *identity,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from images.builder import cache, namespace, paths, pool, progress, runtime_stage, tools
+from images.builder import cache, namespace, paths, pool, progress, runtime_stage, toolchain, tools
 from images.builder.errors import UserError
 from images.builder.lock import read_lock
 
@@ -37,6 +37,21 @@ class Runtime:
         """Headers, for blocks built elsewhere."""
         (package,) = self.directory.glob("flotilla-runtime-dev_*.deb")
         return package
+
+
+def compile_plugin(source: Path, architecture: str) -> bytes:
+    """A C file as a plug-in with blocks for robots of an architecture; errors are the compiler's own words."""
+    lock = read_lock(f"runtime-{architecture}")
+    pool.fill([lock])
+    toolchain_tree = tools.tree(lock)
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".plugin-") as work:
+        shutil.copy(source, work)
+        shutil.copytree(SOURCE / "include", Path(work) / "include")
+        command = ["gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC", "-s", "-I/out/include"]
+        command += ["-Wl,--build-id=none", "-o", "/out/plugin.so", f"/out/{source.name}", "-lm"]
+        stage = {"tools": str(toolchain_tree), "epoch": lock.epoch, "out": work, "command": command}
+        namespace.run_stage(toolchain.__name__, [json.dumps(stage)], Path(work) / "log")
+        return (Path(work) / "plugin.so").read_bytes()
 
 
 def check_task(name: str, content: bytes) -> None:
