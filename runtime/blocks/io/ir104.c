@@ -239,7 +239,8 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(ir104_pbf) = {
     .abi = FL_ABI,
     .name = "ir104-pbf",
-    .summary = "relay board with 20 relays and 20 opto inputs",
+    .summary =
+        "relay board with 20 relays and 20 opto inputs: inputs `command` and `flag` or `sequence`, an output `relays`",
     .source = "Diamond Systems, IR-104-PBF User Manual: register map",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),

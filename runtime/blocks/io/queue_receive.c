@@ -93,7 +93,7 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(queue_receive) = {
     .abi = FL_ABI,
     .name = "queue-receive",
-    .summary = "receives a signal from a queue-send in another task of this computer",
+    .summary = "receives a signal from a queue-send in another task of this computer: an output `data`",
     .source = "POSIX.1-2017, mq_receive; Linux: mq_overview(7)",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),

@@ -89,7 +89,7 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(queue_send) = {
     .abi = FL_ABI,
     .name = "queue-send",
-    .summary = "sends a signal each step to a queue-receive in another task of this computer",
+    .summary = "sends a signal each step to a queue-receive in another task of this computer: an input `data`",
     .source = "POSIX.1-2017, mq_send; Linux: mq_overview(7)",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),

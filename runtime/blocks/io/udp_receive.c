@@ -85,7 +85,7 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(udp_receive) = {
     .abi = FL_ABI,
     .name = "udp-receive",
-    .summary = "receives datagrams of a fixed length, from other robots or the station; at most 64 in a step",
+    .summary = "receives datagrams of `length` bytes, at most 64 in a step: an output `data`, uint8",
     .source = "RFC 768; Linux: udp(7), socket(7)",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),

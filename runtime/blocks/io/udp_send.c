@@ -120,7 +120,7 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(udp_send) = {
     .abi = FL_ABI,
     .name = "udp-send",
-    .summary = "sends a datagram each step, to another robot, the station, or all in reach",
+    .summary = "sends a datagram each step, to one computer or all in reach: an input `data`, uint8",
     .source = "RFC 768; RFC 2474 for the class of service; Linux: udp(7), ip(7)",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),

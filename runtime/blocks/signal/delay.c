@@ -1,5 +1,7 @@
 /* Blocks whose output is of the step before, so that they may close a loop. A task runs the reader of an FL_DELAYED
  * input before the block that writes it: what such an input carries is one step old. */
+#include "ports.h"
+
 #include <float.h>
 #include <flotilla/block.h>
 #include <math.h>
@@ -12,9 +14,7 @@ struct delay {
 };
 
 static const struct fl_parameter delay_parameters[] = {
-    FL_PARAMETER(struct delay, type, .fallback = "double",
-                 .choices = "boolean|int8|uint8|int16|uint16|int32|uint32|int64|uint64|single|double",
-                 .summary = "of the signal"),
+    FL_PARAMETER(struct delay, type, .fallback = "double", .choices = TYPE_CHOICES, .summary = "of the signal"),
     FL_PARAMETER(struct delay, width, .fallback = "1", .min = 1, .max = 65536, .summary = "elements of the signal"),
     FL_PARAMETER(struct delay, initial, .fallback = "0", .summary = "each element of `out` in the first step"),
 };

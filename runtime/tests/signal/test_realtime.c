@@ -24,6 +24,7 @@ static void compute(void **state)
     steps(testbed_block("differential-odometry", "radius", "0.1", "track", "0.4", NULL));
     steps(testbed_block("gain", NULL));
     steps(testbed_block("integrator", NULL));
+    steps(testbed_block("join", NULL));
     steps(testbed_block("limit", "min", "-1", "max", "1", NULL));
     steps(testbed_block("logic", NULL));
     steps(testbed_block("low-pass", "time_constant", "1", NULL));
