@@ -93,6 +93,11 @@ REFUSED = {
     "period without unit": (task("a: {type: gain, in: {in: 1}}", "period: 10"), "10 is not a time such as 10 ms"),
     "period twice": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\nperiod: 2 ms"), "2: task: period is there"),
     "unknown key": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\nrate: 1"), "2: task: unknown key rate; there"),
+    "phase": (
+        task("a: {type: gain, in: {in: 1}}", "period: 1 ms\nphase: 1 ms"),
+        "1: task: phase is not below the period",
+    ),
+    "phase without unit": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\nphase: 0"), "2: phase: 0 is not a time"),
     "priority": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 99"), "2: priority: 99 is not a whole"),
     "priority 1": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 1"), "priority: 1 leaves none below"),
     "policy": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\noverrun: ignore"), "2: overrun: ignore is none of"),
@@ -174,6 +179,12 @@ before: {type: delay, in: {in: ramp.out}}
     assert [row["last.out"] for row in ended.rows] == [row["slow.out"] for row in ended.rows]
     releases = [row["release_ns"] for row in ended.rows]
     assert {after - before for before, after in itertools.pairwise(releases)} == {1_000_000}
+
+
+def test_steps_are_due_at_the_phase(tasks: Tasks) -> None:
+    text = task("a: {type: gain, in: {in: 1}}", "period: 4 ms\nphase: 1500 us")
+    ended = tasks.run(text, "--steps", "3", "--watch", "a.out")
+    assert {row["release_ns"] % 4_000_000 for row in ended.rows} == {1_500_000}
 
 
 def test_steps_are_counted_and_timed(tasks: Tasks) -> None:

@@ -28,26 +28,27 @@ priority: 80
 blocks:
   frames: {{type: frames, parameters: {{device: {device}}}}}
   gyro: {{type: dsp3000, parameters: {{device: {device}}}}}
-  attitude: {{type: pid, in: {{set_point: 0, measurement: gyro.rate}}, parameters: {{kp: 1, min: -1, max: 1}}}}
-  valve: {{type: schmitt-trigger, in: {{in: attitude.out}}, parameters: {{on: 0.1, off: 0.05}}}}
+  attitude: {{type: pid, in: {{set_point: 0, measurement: gyro.rate}}, parameters: {{kp: 1000, min: -1, max: 1}}}}
+  valve: {{type: schmitt-trigger, in: {{in: attitude.out}}, parameters: {{on: 0.01, off: 0}}}}
   relays: {{type: ir104-pbf, in: {{command: valve.on, flag: gyro.flag}}, parameters: {{channels: [1]}}}}
-  chain: {{type: chain, in: {{sequence: gyro.sequence, after: relays.mismatch}}, parameters: {{file: /run/chain.json}}}}
+  chain: {{type: chain, in: {{rate: gyro.rate, after: relays.mismatch}}, parameters: {{file: /run/latencies.json}}}}
 """
 
 FAST = """
 period: 10 ms
 priority: 80
 blocks:
-  wave: {type: trajectory, parameters: {points: [0, 1], times: [0, 10]}}
-  out: {type: queue-send, in: {in: wave.position}, parameters: {name: /wave}}
+  wave: {type: trajectory, parameters: {waypoints: [0, 1], times: [0, 10]}}
+  out: {type: queue-send, in: {data: wave.position}, parameters: {name: /wave}}
 """
 
 SLOW = """
 period: 100 ms
+phase: 5 ms
 priority: 70
 blocks:
   in: {type: queue-receive, parameters: {name: /wave}}
-  filtered: {type: low-pass, in: {in: in.out}, parameters: {time_constant: 1}}
+  filtered: {type: low-pass, in: {in: in.data}, parameters: {time_constant: 1}}
 """
 
 RUN = "flotilla-run --blocks {directory} --steps {steps} --statistics /run/{name}.json {directory}/{name}.yml"
@@ -64,9 +65,9 @@ def run(board: Board, out: Path) -> dict[str, str]:
     chain = RUN.format(name="chain", steps=SECONDS * 100, directory=DIRECTORY)
     fast = RUN.format(name="fast", steps=SECONDS * 100, directory=DIRECTORY)
     slow = RUN.format(name="slow", steps=SECONDS * 10, directory=DIRECTORY)
-    commands = {
-        "chain": ["sh", "-c", f"{chain} && cat /run/chain.json"],
-        "tasks": ["sh", "-c", f"{fast} & {slow} && wait"],
+    commands = {  # which run in the order of their names
+        "chain": ["sh", "-c", f"{chain} && cat /run/latencies.json"],
+        "both": ["sh", "-c", f"{{ {fast}; echo fast: $?; }} 2>&1 & {{ {slow}; echo slow: $?; }} 2>&1; wait"],
         "fast": ["cat", "/run/fast.json"],
         "slow": ["cat", "/run/slow.json"],
     }
@@ -111,6 +112,7 @@ def test_a_frame_becomes_a_valve_within_two_periods(said: dict[str, str]) -> Non
 
 
 def test_two_rates_on_one_computer_keep_their_time(said: dict[str, str]) -> None:
+    assert sorted(said["both"].splitlines()) == ["fast: 0", "slow: 0"]
     fast, slow = read(said["fast"]), read(said["slow"])
     assert (fast["overruns"], slow["overruns"]) == (0, 0)
     assert fast["step"]["count"] == SECONDS * 100

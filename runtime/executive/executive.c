@@ -178,8 +178,8 @@ static void *control(void *argument)
     struct run_result *result = executive->result;
     int64_t in_a_row = 0, period_ns = executive->task->period_ns;
     touch_stack();
-    /* On a multiple of the period, so that tasks of one computer keep their phases. */
-    int64_t release_ns = (fl_now_ns() / period_ns + 2) * period_ns;
+    /* By multiples of the period, so that tasks of one computer keep their phases to each other. */
+    int64_t release_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
     while (!atomic_load_explicit(&executive->stop, memory_order_relaxed)) {
         if (!options->no_wait)
             sleep_until(release_ns);

@@ -374,6 +374,7 @@ void task_build(struct task *task, const struct registry *registry, struct probl
     *task = (struct task){.name = name_of(problems->file)};
     task_file_read(&file, problems);
     task->period_ns = file.period_ns;
+    task->phase_ns = file.phase_ns;
     task->overruns = file.overruns;
     task->overrun = file.overrun;
     task->priority = (int)file.priority;

@@ -17,7 +17,7 @@ struct member {
 
 struct task {
     char *name; /* the file's, without directory and suffix */
-    int64_t period_ns, overruns;
+    int64_t period_ns, phase_ns, overruns;
     int priority;
     enum overrun overrun;
     struct member *members; /* in the order of execution */

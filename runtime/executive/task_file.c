@@ -236,6 +236,13 @@ static void read_period(struct reading *reading, const yaml_node_t *value)
         reading->task->period_ns = period_ns;
 }
 
+static void read_phase(struct reading *reading, const yaml_node_t *value)
+{
+    const char *text = text_of(value);
+    if (!text || !read_duration(text, &reading->task->phase_ns) || reading->task->phase_ns < 0)
+        problem(reading->problems, line_of(value), "phase: %s is not a time such as 5 ms", text ? text : "a list");
+}
+
 static void read_priority(struct reading *reading, const yaml_node_t *value)
 {
     int64_t priority = 0;
@@ -267,12 +274,21 @@ static void read_overruns(struct reading *reading, const yaml_node_t *value)
 
 static const struct key task_keys[] = {
     {"period", true, read_period, "the time between two steps, such as 10 ms"},
+    {"phase", false, read_phase, NULL},
     {"priority", false, read_priority, NULL},
     {"overrun", false, read_overrun, NULL},
     {"overruns", false, read_overruns, NULL},
     {"blocks", true, read_blocks, "what the task is made of"},
     {0},
 };
+
+static void read_task(struct reading *reading, const yaml_node_t *root)
+{
+    const struct task_file *task = reading->task;
+    read_keys(reading, root, task_keys, "task");
+    if (task->period_ns && task->phase_ns >= task->period_ns)
+        problem(reading->problems, line_of(root), "task: phase is not below the period");
+}
 
 void task_file_read(struct task_file *task, struct problems *problems)
 {
@@ -293,7 +309,7 @@ void task_file_read(struct task_file *task, struct problems *problems)
     } else {
         const yaml_node_t *root = yaml_document_get_root_node(&task->document);
         if (root)
-            read_keys(&reading, root, task_keys, "task");
+            read_task(&reading, root);
         else
             problem(problems, 0, "it is empty");
     }

@@ -1,6 +1,7 @@
 /* A task file as it is written: what YAML says, with lines, not yet compared with the blocks that exist.
  *
  *     period: 10 ms            # ns, us, ms, s
+ *     phase: 0 ms              # steps are due this long after each multiple of the period
  *     priority: 80             # SCHED_FIFO, 2 to 98; 0: ordinary scheduling
  *     overrun: skip            # what follows a step that ends after the next one was due: skip, catch-up, stop-safe
  *     overruns: 10             # that many in a row lead to the safe state; 0: never
@@ -32,7 +33,7 @@ struct block_entry {
 };
 
 struct task_file {
-    int64_t period_ns, priority, overruns;
+    int64_t period_ns, phase_ns, priority, overruns;
     enum overrun overrun;
     struct block_entry *blocks; /* in the order of the file */
     size_t count;

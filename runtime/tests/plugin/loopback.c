@@ -1,5 +1,5 @@
-/* Plug-in for a loop inside one computer: a gyro's frames into a UART whose output is its own input, and the time from a
- * frame to what comes of it. Both blocks are of one task: they share the times of the frames. */
+/* Plug-in for a loop inside one computer: a gyro's frames into a UART whose output is its own input, and the time from
+ * a frame to what comes of it. Both blocks are of one task: they share the times of the frames. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <fcntl.h>
@@ -16,6 +16,9 @@
 #ifndef TIOCM_LOOP
 #define TIOCM_LOOP 0x8000
 #endif
+
+#define DEG_S_PER_FRAME 0.001
+#define DEG             (3.14159265358979323846 / 180)
 
 enum { FRAMES = 1 << 16, BUCKETS = 100 * 1000 };
 
@@ -45,15 +48,17 @@ static int frames_start(struct fl_block *block)
     return FL_OK;
 }
 
-/* Turns to and fro, so that the controller switches. */
+/* Turns to and fro, so that the controller switches each time; how fast says which frame it is. */
 static int frames_step(struct fl_block *block)
 {
     char frame[32];
     struct frames_state *state = block->state;
     if (block->step < 50 || state->count + 1 >= FRAMES) /* the driver has to open the port */
         return FL_OK;
-    int size = snprintf(frame, sizeof frame, "%15.6f   1\r\n", 20 * sin((double)block->step / 7));
-    written_ns[++state->count] = fl_now_ns();
+    state->count++;
+    double rate_deg_s = (state->count % 2 ? 1 : -1) * DEG_S_PER_FRAME * state->count;
+    int size = snprintf(frame, sizeof frame, "%15.6f   1\r\n", rate_deg_s);
+    written_ns[state->count] = fl_now_ns();
     if (write(state->fd, frame, (size_t)size) != size)
         return fl_fail(block, "the port takes no frame");
     return FL_OK;
@@ -87,23 +92,23 @@ struct chain {
 };
 
 struct chain_state {
-    uint32_t sequence, late, histogram[BUCKETS];
+    uint32_t frame, late, histogram[BUCKETS];
 };
 
 static const struct fl_parameter chain_parameters[] = {FL_PARAMETER(struct chain, file)};
 static const struct fl_port chain_inputs[] = {
-    {.name = "sequence", .type = FL_UINT32, .width = 1},
+    {.name = "rate", .type = FL_DOUBLE, .width = 1, .unit = "rad/s"},
     {.name = "after", .type = FL_BOOLEAN, .width = 1}, /* only to run after it */
 };
 
 static int chain_step(struct fl_block *block)
 {
     struct chain_state *state = block->state;
-    uint32_t sequence = FL_IN(block, 0, uint32_t);
-    if (sequence == state->sequence || sequence >= FRAMES)
+    uint32_t frame = (uint32_t)lround(fabs(FL_IN(block, 0, double)) / DEG / DEG_S_PER_FRAME);
+    if (frame == state->frame || frame >= FRAMES)
         return FL_OK;
-    state->sequence = sequence;
-    int64_t us = (fl_now_ns() - written_ns[sequence]) / 1000;
+    state->frame = frame;
+    int64_t us = (fl_now_ns() - written_ns[frame]) / 1000;
     if (us >= 0 && us < BUCKETS)
         state->histogram[us]++;
     else
