@@ -37,6 +37,7 @@ SYSTEMS = [(PENTIUM, "lean"), (PENTIUM, "debian"), (PC, "debian")]
 """Boards and kernels that every image must boot with."""
 SECONDS = 60
 """Limit for what takes a few on an idle host."""
+IDLE_S = 10
 MEMORY_LIMIT_MB = {PENTIUM: 40, PC: 70}
 """In use after boot: MemTotal - MemAvailable, in 10^6 bytes. 64-bit programs and a larger kernel take more."""
 PROCESSOR = {PENTIUM: "Pentium III", PC: "Nehalem"}
@@ -470,6 +471,15 @@ def test_processor_stays_awake(robot: RobotGuest) -> None:
         assert sh(robot, read) != "0", "0 µs although nobody asks for it: the check is blind"
     finally:
         sh(robot, "systemctl start flotilla-dma-latency")
+
+
+def test_an_idle_robot_leaves_the_host_alone(robot: RobotGuest, report: Report) -> None:
+    """How much of a host's processor the guest takes when nothing happens: printed, since the host is shared."""
+    before, begun = robot.machine.processor_s, time.monotonic()
+    time.sleep(IDLE_S)  # what is measured is that nothing happens
+    share = (robot.machine.processor_s - before) / (time.monotonic() - begun)
+    report.add(label(robot), idle_host_percent=100 * share)
+    assert share > 0, "the guest's time is not counted"
 
 
 def test_hardware_can_be_reported(robot: RobotGuest) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
 import shlex
 import socket
@@ -79,6 +80,12 @@ class Emulator:
     @property
     def pid(self) -> int:
         return self._process.pid
+
+    @property
+    def processor_s(self) -> float:
+        """Seconds of a processor of the host that it has taken so far."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")  # utime, stime: proc(5)
 
     @property
     def running(self) -> bool:

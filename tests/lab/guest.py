@@ -61,6 +61,11 @@ class Guest:
     def name(self) -> str:
         return self._options.name
 
+    @property
+    def processor_s(self) -> float:
+        """Seconds of a processor of the host that the running guest has taken so far."""
+        return self._running().processor_s
+
     # Power
 
     def prepare(self) -> None:

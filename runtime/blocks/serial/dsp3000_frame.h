@@ -27,7 +27,8 @@ bool dsp3000_text_feed(struct dsp3000_text *text, uint8_t byte, struct dsp3000_s
 
 /* Words of four bytes, the most significant first, without anything between them that says where one begins: bit 31
  * valid, 30-29 synchronisation, 28-27 mode, 26 odd parity of the whole, 25-0 two's complement. So all four ways to cut
- * the stream are tried at once, and the one is believed that has been right for some time when the others were not. */
+ * the stream are tried at once, and the one is believed that has been right for some time when the others were not.
+ * Parity finds a single wrong bit, but is no checksum: of random words in place of right ones, one in eighty passes. */
 struct dsp3000_words {
     uint8_t mode;     /* enum dsp3000_mode that is expected: words of another are wrong */
     uint32_t window;  /* the last four bytes */

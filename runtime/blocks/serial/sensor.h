@@ -27,13 +27,15 @@ static inline bool sensor_take(struct sensor *sensor, bool good, int64_t arrived
     return good;
 }
 
-/* Write flag, age and sequence, the last three outputs. A value as old as `timeout` is still good. */
-static inline void sensor_outputs(const struct sensor *sensor, struct fl_block *block, bool connected, double timeout)
+/* Write flag, age and sequence, the last three outputs. A value as old as `timeout` is still good; but when the device
+ * was gone, however briefly, only a new one is. */
+static inline void sensor_outputs(struct sensor *sensor, struct fl_block *block, bool connected, double timeout)
 {
     uint32_t first = block->out_count - 3;
+    sensor->good = sensor->good && connected;
     /* What came between the release of this step and now is new, not from the future. */
     int64_t age_ns = block->release_ns > sensor->arrived_ns ? block->release_ns - sensor->arrived_ns : 0;
-    FL_OUT(block, first, bool) = connected && sensor->good && (double)age_ns <= timeout * 1e9;
+    FL_OUT(block, first, bool) = sensor->good && (double)age_ns <= timeout * 1e9;
     FL_OUT(block, first + 1, double) = (double)age_ns / 1e9;
     FL_OUT(block, first + 2, uint32_t) = sensor->sequence;
 }

@@ -173,6 +173,8 @@ static void grows_stale_and_notices_unplugging(void **state)
     STEP_UNTIL(compass, !GET(compass, "flag", bool));
     line_plug(&line);
     assert_true(line_hears(&line, "go\r"));
+    assert_int_equal(line_step(compass), FL_OK);
+    assert_false(GET(compass, "flag", bool)); /* the value is as good as before, but of before */
     line_say(&line, "$C1.00X-106.00Y-403.00Z98.00*1E\r\n");
     STEP_UNTIL(compass, GET(compass, "sequence", uint32_t) == 2);
     assert_true(GET(compass, "flag", bool));

@@ -1,0 +1,152 @@
+#define _GNU_SOURCE
+#include "topic.h"
+
+#include <errno.h>
+#include <stdatomic.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+enum { WAITING = 4, RETRY_MS = 1000 };
+
+struct state {
+    struct dds_settings settings;
+    struct fl_block *block;
+    struct fl_driver *driver;
+    struct fl_ring samples;
+    struct dds_sample taken; /* the thread's */
+    void *storage;
+    int wake[2]; /* a byte for each sample: the step's end, and the thread's */
+    uint32_t number;
+    _Atomic uint32_t peers, written;
+};
+
+static const struct fl_parameter parameters[] = {DDS_PARAMETERS(struct dds_settings)};
+
+enum { PEERS, WRITTEN };
+static const struct fl_port outputs[] = {
+    {.name = "peers", .type = FL_UINT32, .width = 1, .summary = "subscribers that are known now"},
+    {.name = "written", .type = FL_UINT32, .width = 1, .summary = "samples that DDS took"},
+};
+
+static void matched(dds_entity_t writer, const dds_publication_matched_status_t status, void *context)
+{
+    struct state *state = context;
+    (void)writer;
+    atomic_store(&state->peers, status.current_count);
+}
+
+/* The newest that waits is written; those before it are worth nothing any more. */
+static void write_newest(struct state *state, dds_entity_t writer)
+{
+    char tokens[64];
+    bool any = false;
+    while (recv(state->wake[1], tokens, sizeof tokens, MSG_DONTWAIT) > 0)
+        ;
+    while (fl_ring_take(&state->samples, &state->taken))
+        any = true;
+    if (!any)
+        return;
+    dds_encode(&state->settings, &state->taken, state->storage);
+    if (dds_write(writer, state->storage) == DDS_RETCODE_OK)
+        atomic_fetch_add(&state->written, 1);
+}
+
+/* Until the thread shall return: true; or false when DDS cannot be had now. */
+static bool publish(struct state *state, struct fl_driver *driver, dds_entity_t participant)
+{
+    dds_listener_t *listener = dds_create_listener(state);
+    dds_qos_t *qualities = dds_qualities(&state->settings);
+    dds_lset_publication_matched(listener, matched);
+    dds_entity_t topic = dds_open_topic(&state->settings, participant);
+    dds_entity_t writer = topic < 0 ? topic : dds_create_writer(participant, topic, qualities, listener);
+    dds_delete_qos(qualities);
+    dds_delete_listener(listener);
+    if (writer < 0)
+        fl_log(state->block, "topic %s: %s", state->settings.topic, dds_strretcode(writer));
+    while (writer >= 0 && fl_driver_wait(driver, state->wake[1], false, -1) == 1)
+        write_newest(state, writer);
+    if (writer >= 0)
+        dds_delete(writer);
+    if (topic >= 0)
+        dds_delete(topic);
+    return writer >= 0;
+}
+
+static void run(struct fl_driver *driver, void *context)
+{
+    struct state *state = context;
+    uint32_t domain = (uint32_t)state->settings.domain;
+    do {
+        dds_entity_t participant = dds_participant(domain);
+        if (participant < 0) {
+            fl_log(state->block, "DDS domain %u: %s", (unsigned)domain, dds_strretcode(participant));
+            continue;
+        }
+        bool done = publish(state, driver, participant);
+        dds_release_participant(domain);
+        if (done)
+            return;
+    } while (fl_driver_wait(driver, -1, false, RETRY_MS) == 0);
+}
+
+static int configure(struct fl_block *block)
+{
+    return fl_add_input(block, dds_port(block->parameters));
+}
+
+static int start(struct fl_block *block)
+{
+    struct state *state = block->state;
+    void *memory = fl_allocate(block, fl_ring_bytes(sizeof(struct dds_sample), WAITING));
+    state->storage = fl_allocate(block, dds_storage_bytes());
+    if (!memory || !state->storage)
+        return FL_FAILED;
+    state->settings = *(const struct dds_settings *)block->parameters;
+    state->block = block;
+    fl_ring_initialize(&state->samples, memory, sizeof(struct dds_sample), WAITING);
+    if (socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, state->wake) < 0)
+        return fl_fail(block, "socketpair: %s", strerror(errno));
+    state->driver = fl_driver_start(block, run, state);
+    return state->driver ? FL_OK : FL_FAILED;
+}
+
+static int step(struct fl_block *block)
+{
+    struct state *state = block->state;
+    struct dds_sample sample = {.robot = (uint16_t)state->settings.robot, .number = state->number++};
+    struct timespec real;
+    clock_gettime(CLOCK_REALTIME, &real);
+    sample.stamp_ns = real.tv_sec * INT64_C(1000000000) + real.tv_nsec;
+    memcpy(sample.values, block->in[0], dds_value_bytes(&state->settings));
+    if (fl_ring_put(&state->samples, &sample))
+        send(state->wake[0], "", 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+    FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
+    FL_OUT(block, WRITTEN, uint32_t) = atomic_load(&state->written);
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    fl_driver_stop(state->driver);
+    for (int i = 0; i < 2; i++)
+        if (state->wake[i] > 0)
+            close(state->wake[i]);
+}
+
+FL_BLOCK(dds_publish) = {
+    .abi = FL_ABI,
+    .name = "dds-publish",
+    .summary = "publishes its input as a sample of a DDS topic, in each step",
+    .source = "OMG DDS 1.4; DDSI-RTPS 2.5; Eclipse Cyclone DDS 0.10",
+    FL_TABLE(output, outputs),
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct dds_settings),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .terminate = terminate,
+};

@@ -1,0 +1,179 @@
+#define _GNU_SOURCE
+#include "topic.h"
+
+#include <math.h>
+#include <stdatomic.h>
+#include <string.h>
+
+enum { WAITING = 16, RETRY_MS = 1000, BATCH = 8 };
+
+struct dds_subscribe {
+    struct dds_settings common;
+    double timeout;
+};
+
+struct state {
+    struct dds_settings settings;
+    struct fl_block *block;
+    struct fl_driver *driver;
+    struct fl_ring samples;
+    struct dds_sample arriving, taken; /* DDS's thread's, the step's */
+    _Atomic uint32_t peers;
+    _Atomic bool late; /* the deadline passed since the last sample */
+    int64_t arrived_ns;
+    uint32_t sequence;
+};
+
+static const struct fl_parameter parameters[] = {
+    DDS_PARAMETERS(struct dds_settings),
+    FL_PARAMETER(struct dds_subscribe, timeout, .fallback = "0.1", .min = 1e-6, .max = 1e6, .unit = "s",
+                 .summary = "age at which a sample is no longer good"),
+};
+
+enum { VALUES, NUMBER, STAMP, PEERS, FLAG, AGE, SEQUENCE };
+
+static void matched(dds_entity_t reader, const dds_subscription_matched_status_t status, void *context)
+{
+    struct state *state = context;
+    (void)reader;
+    atomic_store(&state->peers, status.current_count);
+}
+
+static void missed(dds_entity_t reader, const dds_requested_deadline_missed_status_t status, void *context)
+{
+    struct state *state = context;
+    (void)reader;
+    (void)status;
+    atomic_store(&state->late, true);
+}
+
+/* Called by DDS, one call at a time for a reader. A topic carries the samples of all robots; one is wanted. */
+static void arrived(dds_entity_t reader, void *context)
+{
+    struct state *state = context;
+    void *samples[BATCH] = {NULL};
+    dds_sample_info_t infos[BATCH];
+    dds_return_t count;
+    int64_t now_ns = fl_now_ns();
+    while ((count = dds_take(reader, samples, infos, BATCH, BATCH)) > 0) {
+        for (dds_return_t i = 0; i < count; i++) {
+            if (!infos[i].valid_data || !dds_decode(&state->settings, samples[i], &state->arriving) ||
+                state->arriving.robot != state->settings.robot)
+                continue;
+            state->arriving.arrived_ns = now_ns;
+            atomic_store(&state->late, false);
+            fl_ring_put(&state->samples, &state->arriving);
+        }
+        dds_return_loan(reader, samples, count);
+        samples[0] = NULL;
+    }
+}
+
+/* Until the thread shall return: true; or false when DDS cannot be had now. */
+static bool subscribe(struct state *state, struct fl_driver *driver, dds_entity_t participant)
+{
+    dds_listener_t *listener = dds_create_listener(state);
+    dds_qos_t *qualities = dds_qualities(&state->settings);
+    dds_lset_data_available(listener, arrived);
+    dds_lset_subscription_matched(listener, matched);
+    dds_lset_requested_deadline_missed(listener, missed);
+    dds_entity_t topic = dds_open_topic(&state->settings, participant);
+    dds_entity_t reader = topic < 0 ? topic : dds_create_reader(participant, topic, qualities, listener);
+    dds_delete_qos(qualities);
+    dds_delete_listener(listener);
+    if (reader < 0)
+        fl_log(state->block, "topic %s: %s", state->settings.topic, dds_strretcode(reader));
+    else
+        fl_driver_wait(driver, -1, false, -1);
+    if (reader >= 0)
+        dds_delete(reader); /* waits for a listener that is being called */
+    if (topic >= 0)
+        dds_delete(topic);
+    return reader >= 0;
+}
+
+static void run(struct fl_driver *driver, void *context)
+{
+    struct state *state = context;
+    uint32_t domain = (uint32_t)state->settings.domain;
+    do {
+        dds_entity_t participant = dds_participant(domain);
+        if (participant < 0) {
+            fl_log(state->block, "DDS domain %u: %s", (unsigned)domain, dds_strretcode(participant));
+            continue;
+        }
+        bool done = subscribe(state, driver, participant);
+        dds_release_participant(domain);
+        if (done)
+            return;
+    } while (fl_driver_wait(driver, -1, false, RETRY_MS) == 0);
+}
+
+static int configure(struct fl_block *block)
+{
+    const struct fl_port outputs[] = {
+        dds_port(block->parameters),
+        {.name = "number", .type = FL_UINT32, .width = 1, .summary = "the sender's count of its samples"},
+        {.name = "stamp", .type = FL_INT64, .width = 1, .unit = "ns", .summary = "the sender's fleet time"},
+        {.name = "peers", .type = FL_UINT32, .width = 1, .summary = "publishers of the topic that are known now"},
+        FL_SENSOR_OUTPUTS,
+    };
+    for (size_t i = 0; i < sizeof outputs / sizeof outputs[0]; i++)
+        if (fl_add_output(block, outputs[i]) != FL_OK)
+            return FL_FAILED;
+    return FL_OK;
+}
+
+static int start(struct fl_block *block)
+{
+    struct state *state = block->state;
+    void *memory = fl_allocate(block, fl_ring_bytes(sizeof(struct dds_sample), WAITING));
+    if (!memory)
+        return FL_FAILED;
+    state->settings = ((const struct dds_subscribe *)block->parameters)->common;
+    state->block = block;
+    state->arrived_ns = fl_now_ns();
+    fl_ring_initialize(&state->samples, memory, sizeof(struct dds_sample), WAITING);
+    state->driver = fl_driver_start(block, run, state);
+    return state->driver ? FL_OK : FL_FAILED;
+}
+
+static int step(struct fl_block *block)
+{
+    const struct dds_subscribe *set = block->parameters;
+    struct state *state = block->state;
+    for (int i = 0; i < WAITING && fl_ring_take(&state->samples, &state->taken); i++) {
+        memcpy(block->out[VALUES], state->taken.values, dds_value_bytes(&state->settings));
+        FL_OUT(block, NUMBER, uint32_t) = state->taken.number;
+        FL_OUT(block, STAMP, int64_t) = state->taken.stamp_ns;
+        state->arrived_ns = state->taken.arrived_ns;
+        state->sequence++;
+    }
+    int64_t age_ns = block->release_ns > state->arrived_ns ? block->release_ns - state->arrived_ns : 0;
+    FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
+    FL_OUT(block, FLAG, uint8_t) =
+        state->sequence && !atomic_load(&state->late) && age_ns <= llround(set->timeout * 1e9);
+    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
+    FL_OUT(block, SEQUENCE, uint32_t) = state->sequence;
+    return FL_OK;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    fl_driver_stop(state->driver);
+}
+
+FL_BLOCK(dds_subscribe) = {
+    .abi = FL_ABI,
+    .name = "dds-subscribe",
+    .summary = "the newest sample that a robot published on a DDS topic",
+    .source = "OMG DDS 1.4; DDSI-RTPS 2.5; Eclipse Cyclone DDS 0.10",
+    FL_TABLE(parameter, parameters),
+    .parameters_size = sizeof(struct dds_subscribe),
+    .state_size = sizeof(struct state),
+    .configure = configure,
+    .start = start,
+    .step = step,
+    .terminate = terminate,
+};

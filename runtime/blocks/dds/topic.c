@@ -1,0 +1,146 @@
+#include "topic.h"
+
+#include "flotilla.h"
+
+#include <math.h>
+#include <pthread.h>
+#include <string.h>
+
+union dds_storage {
+    flotilla_State state;
+    flotilla_Wrench wrench;
+    flotilla_Valves valves;
+    flotilla_Bytes bytes;
+};
+
+enum { STATE, WRENCH, VALVES, BYTES };
+
+/* The values of a type lie one after the other: an array, or members of one type. */
+#define VALUES(type, first, last)                                                                                      \
+    offsetof(type, first), offsetof(type, last) + sizeof(((type *)NULL)->last) - offsetof(type, first)
+
+static const struct {
+    const dds_topic_descriptor_t *descriptor;
+    struct fl_port port;
+    size_t offset, bytes;
+} types[] = {
+    [STATE] = {&flotilla_State_desc,
+               {.name = "state",
+                .type = FL_DOUBLE,
+                .width = 6,
+                .summary = "x and y (m), heading (rad), and their rates (m/s, m/s, rad/s)"},
+               VALUES(flotilla_State, x, heading_rate)},
+    [WRENCH] = {&flotilla_Wrench_desc,
+                {.name = "wrench", .type = FL_DOUBLE, .width = 3, .summary = "forces along x and y (N), torque (N·m)"},
+                VALUES(flotilla_Wrench, x_force, torque)},
+    [VALVES] = {&flotilla_Valves_desc,
+                {.name = "valves", .type = FL_BOOLEAN, .width = 8, .summary = "1: open"},
+                VALUES(flotilla_Valves, open, open)},
+    [BYTES] = {&flotilla_Bytes_desc, {.name = "data", .type = FL_UINT8, .summary = "bytes, as packed"}, 0, 0},
+};
+
+_Static_assert(sizeof(bool) == 1, "a boolean port has one byte");
+_Static_assert(offsetof(flotilla_State, heading_rate) - offsetof(flotilla_State, x) == 5 * sizeof(double), "no gaps");
+_Static_assert(offsetof(flotilla_Wrench, torque) - offsetof(flotilla_Wrench, x_force) == 2 * sizeof(double), "no gaps");
+_Static_assert(flotilla_MOST_BYTES == DDS_VALUES, "one limit");
+
+struct fl_port dds_port(const struct dds_settings *settings)
+{
+    struct fl_port port = types[settings->type].port;
+    if (settings->type == BYTES)
+        port.width = (uint32_t)settings->bytes;
+    return port;
+}
+
+size_t dds_value_bytes(const struct dds_settings *settings)
+{
+    return settings->type == BYTES ? (size_t)settings->bytes : types[settings->type].bytes;
+}
+
+size_t dds_storage_bytes(void)
+{
+    return sizeof(union dds_storage);
+}
+
+void dds_encode(const struct dds_settings *settings, const struct dds_sample *sample, void *storage)
+{
+    /* The header comes first in each type. */
+    *(flotilla_Header *)storage = (flotilla_Header){sample->robot, sample->number, sample->stamp_ns};
+    if (settings->type == BYTES) /* DDS only reads it */
+        ((flotilla_Bytes *)storage)->data = (dds_sequence_octet){(uint32_t)settings->bytes, (uint32_t)settings->bytes,
+                                                                 (uint8_t *)(uintptr_t)sample->values, false};
+    else
+        memcpy((char *)storage + types[settings->type].offset, sample->values, types[settings->type].bytes);
+}
+
+bool dds_decode(const struct dds_settings *settings, const void *storage, struct dds_sample *sample)
+{
+    const flotilla_Header *header = storage;
+    const dds_sequence_octet *data = &((const flotilla_Bytes *)storage)->data;
+    if (settings->type == BYTES && data->_length != settings->bytes)
+        return false;
+    memcpy(sample->values,
+           settings->type == BYTES ? data->_buffer : (const uint8_t *)storage + types[settings->type].offset,
+           dds_value_bytes(settings));
+    sample->robot = header->robot;
+    sample->number = header->number;
+    sample->stamp_ns = header->stamp;
+    return true;
+}
+
+/* --- participants --- */
+
+/* A participant costs a port, discovery packets to every peer, and threads: one for each domain of a program, however
+ * many blocks. It belongs to the process as its sockets do, so this is no state of a block. */
+enum { DOMAINS = 8 };
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+static struct {
+    uint32_t domain;
+    unsigned users;
+    dds_entity_t participant;
+} participants[DOMAINS];
+
+dds_entity_t dds_participant(uint32_t domain)
+{
+    dds_entity_t result = DDS_RETCODE_OUT_OF_RESOURCES;
+    int slot = -1;
+    pthread_mutex_lock(&lock);
+    for (int i = 0; i < DOMAINS; i++)
+        if (participants[i].users ? participants[i].domain == domain : slot < 0)
+            slot = i;
+    if (slot >= 0 && !participants[slot].users)
+        participants[slot].participant = dds_create_participant(domain, NULL, NULL);
+    if (slot >= 0 && (result = participants[slot].participant) >= 0) {
+        participants[slot].domain = domain;
+        participants[slot].users++;
+    }
+    pthread_mutex_unlock(&lock);
+    return result;
+}
+
+void dds_release_participant(uint32_t domain)
+{
+    pthread_mutex_lock(&lock);
+    for (int i = 0; i < DOMAINS; i++)
+        if (participants[i].users && participants[i].domain == domain && --participants[i].users == 0)
+            dds_delete(participants[i].participant);
+    pthread_mutex_unlock(&lock);
+}
+
+/* --- topics --- */
+
+dds_entity_t dds_open_topic(const struct dds_settings *settings, dds_entity_t participant)
+{
+    return dds_create_topic(participant, types[settings->type].descriptor, settings->topic, NULL, NULL);
+}
+
+dds_qos_t *dds_qualities(const struct dds_settings *settings)
+{
+    dds_qos_t *qualities = dds_create_qos();
+    dds_qset_history(qualities, DDS_HISTORY_KEEP_LAST, 1); /* control wants the newest or none */
+    dds_qset_reliability(qualities, settings->reliability ? DDS_RELIABILITY_RELIABLE : DDS_RELIABILITY_BEST_EFFORT,
+                         DDS_MSECS(100));
+    if (settings->deadline > 0)
+        dds_qset_deadline(qualities, llround(settings->deadline * 1e9));
+    return qualities;
+}

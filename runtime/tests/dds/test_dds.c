@@ -1,0 +1,318 @@
+/* Publishers and subscribers in one process and in two, on loopback only: no multicast, no other interface. */
+#define _GNU_SOURCE
+#include "seccomp.h"
+#include "testbed.h"
+
+#include <poll.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/wait.h>
+#include <time.h>
+#include <unistd.h>
+
+enum { PATIENCE_MS = 20000, PERIOD_MS = 10 };
+
+static char domain[8]; /* of this process, so that two runs on a computer do not meet */
+
+/* What the fleet's configuration says too, but for the addresses. */
+static void configure_dds(const char *index)
+{
+    char uri[1024];
+    snprintf(uri, sizeof uri,
+             "<CycloneDDS><Domain Id=\"any\"><General>"
+             "<Interfaces><NetworkInterface name=\"lo\" multicast=\"false\"/></Interfaces>"
+             "<AllowMulticast>false</AllowMulticast>"
+             "<MaxMessageSize>1400B</MaxMessageSize><FragmentSize>1300B</FragmentSize></General>"
+             "<Discovery><ParticipantIndex>%s</ParticipantIndex><MaxAutoParticipantIndex>4</MaxAutoParticipantIndex>"
+             "<Peers><Peer Address=\"127.0.0.1\"/></Peers></Discovery></Domain></CycloneDDS>",
+             index);
+    setenv("CYCLONEDDS_URI", uri, 1);
+}
+
+struct node {
+    const char *type, *topic, *robot, *more, *value;
+};
+
+static struct fl_block *publisher(struct node node)
+{
+    struct fl_block *block = testbed_block("dds-publish", "type", node.type, "topic", node.topic, "robot", node.robot,
+                                           "domain", domain, node.more, node.value, NULL);
+    testbed_begin(block);
+    return block;
+}
+
+static struct fl_block *subscriber(struct node node)
+{
+    struct fl_block *block = testbed_block("dds-subscribe", "timeout", "30", "type", node.type, "topic", node.topic,
+                                           "robot", node.robot, "domain", domain, node.more, node.value, NULL);
+    testbed_begin(block);
+    return block;
+}
+
+static void step(struct fl_block *block)
+{
+    block->release_ns = fl_now_ns() - block->period_ns;
+    assert_int_equal(testbed_step(block), FL_OK);
+}
+
+/* Step these at their period until the first's output `port` is `wanted`. */
+static bool reaches(struct fl_block *block, const char *port, uint32_t wanted, struct fl_block *other)
+{
+    for (int waited = 0; waited < PATIENCE_MS; waited += PERIOD_MS) {
+        const void *output = testbed_output(block, port);
+        step(block);
+        if (other)
+            step(other);
+        if ((strcmp(port, "flag") == 0 ? *(const uint8_t *)output : *(const uint32_t *)output) == wanted)
+            return true;
+        poll(NULL, 0, PERIOD_MS);
+    }
+    return false;
+}
+
+static void passes_a_state(void **state)
+{
+    (void)state;
+    const double values[6] = {1.5, -2, 0.25, 1e-3, 5, -6};
+    struct fl_block *from = publisher((struct node){"state", "state", "3", NULL, NULL});
+    struct fl_block *to = subscriber((struct node){"state", "state", "3", NULL, NULL});
+    memcpy(testbed_input(from, "state"), values, sizeof values);
+    step(to);
+    assert_int_equal(GET(to, "flag", uint8_t), 0);
+    assert_true(reaches(to, "flag", 1, from));
+    assert_memory_equal(testbed_output(to, "state"), values, sizeof values);
+    assert_true(reaches(from, "peers", 1, NULL));
+    assert_int_equal(GET(to, "peers", uint32_t), 1);
+    uint32_t sequence = GET(to, "sequence", uint32_t), number = GET(to, "number", uint32_t);
+    assert_true(reaches(to, "sequence", sequence + 5, from));
+    assert_true(GET(to, "number", uint32_t) >= number + 5);
+    struct timespec real;
+    clock_gettime(CLOCK_REALTIME, &real);
+    assert_near((double)(real.tv_sec - GET(to, "stamp", int64_t) / 1000000000), 0, 30);
+    testbed_end(from);
+    assert_true(reaches(to, "peers", 0, NULL)); /* it says so when it goes */
+    to->release_ns = fl_now_ns() + INT64_C(31000000000);
+    assert_int_equal(testbed_step(to), FL_OK);
+    assert_int_equal(GET(to, "flag", uint8_t), 0);
+    testbed_end(to);
+}
+
+static void passes_each_type(void **state)
+{
+    (void)state;
+    const double wrench[3] = {0.1, -0.2, 0.3};
+    const uint8_t valves[8] = {1, 0, 0, 1, 1, 0, 1, 0};
+    static const struct {
+        const char *type, *port;
+        size_t bytes;
+    } types[] = {{"wrench", "wrench", sizeof wrench}, {"valves", "valves", 8}, {"bytes", "data", 5}};
+    const void *values[] = {wrench, valves, "hello"};
+    for (int i = 0; i < 3; i++) {
+        const char *more = i == 2 ? "bytes" : NULL;
+        struct fl_block *from = publisher((struct node){types[i].type, types[i].type, "1", more, "5"});
+        struct fl_block *to = subscriber((struct node){types[i].type, types[i].type, "1", more, "5"});
+        memcpy(testbed_input(from, types[i].port), values[i], types[i].bytes);
+        assert_true(reaches(to, "flag", 1, from));
+        assert_memory_equal(testbed_output(to, types[i].port), values[i], types[i].bytes);
+        testbed_end(from);
+        testbed_end(to);
+    }
+}
+
+/* A topic carries the samples of all robots. */
+static void hears_one_robot(void **state)
+{
+    (void)state;
+    struct fl_block *one = publisher((struct node){"wrench", "w", "1", NULL, NULL});
+    struct fl_block *two = publisher((struct node){"wrench", "w", "2", NULL, NULL});
+    struct fl_block *to = subscriber((struct node){"wrench", "w", "2", NULL, NULL});
+    *(double *)testbed_input(one, "wrench") = 1;
+    *(double *)testbed_input(two, "wrench") = 2;
+    assert_true(reaches(to, "peers", 2, one));
+    assert_true(reaches(one, "written", GET(one, "written", uint32_t) + 20, NULL));
+    step(to);
+    assert_int_equal(GET(to, "sequence", uint32_t), 0);
+    assert_true(reaches(to, "flag", 1, two));
+    assert_near(*(const double *)testbed_output(to, "wrench"), 2, 0);
+    testbed_end(one);
+    testbed_end(two);
+    testbed_end(to);
+}
+
+static void takes_no_other_length(void **state)
+{
+    (void)state;
+    struct fl_block *from = publisher((struct node){"bytes", "b", "1", "bytes", "8"});
+    struct fl_block *to = subscriber((struct node){"bytes", "b", "1", "bytes", "9"});
+    struct fl_block *fitting = subscriber((struct node){"bytes", "b", "1", "bytes", "8"});
+    assert_true(reaches(to, "peers", 1, from));
+    assert_true(reaches(fitting, "flag", 1, from));
+    step(to);
+    assert_int_equal(GET(to, "flag", uint8_t), 0);
+    testbed_end(from);
+    testbed_end(to);
+    testbed_end(fitting);
+}
+
+/* Who asks for more than is offered is not matched: so the qualities reach DDS. */
+static void qualities_are_asked_for(void **state)
+{
+    (void)state;
+    struct fl_block *from = publisher((struct node){"state", "q", "1", NULL, NULL});
+    struct fl_block *more = subscriber((struct node){"state", "q", "1", "reliability", "reliable"});
+    struct fl_block *sooner = subscriber((struct node){"state", "q", "1", "deadline", "1"});
+    struct fl_block *same = subscriber((struct node){"state", "q", "1", NULL, NULL});
+    assert_true(reaches(same, "flag", 1, from));
+    step(more);
+    step(sooner);
+    assert_int_equal(GET(same, "peers", uint32_t), 1);
+    assert_int_equal(GET(more, "peers", uint32_t), 0);
+    assert_int_equal(GET(sooner, "peers", uint32_t), 0);
+    testbed_end(from);
+    testbed_end(more);
+    testbed_end(sooner);
+    testbed_end(same);
+}
+
+static void a_missed_deadline_is_no_good(void **state)
+{
+    (void)state;
+    struct fl_block *from = publisher((struct node){"state", "d", "1", "deadline", "0.2"});
+    struct fl_block *to = subscriber((struct node){"state", "d", "1", "deadline", "0.2"});
+    assert_true(reaches(to, "flag", 1, from));
+    assert_true(reaches(to, "flag", 0, NULL)); /* long before the time-out of 30 s */
+    assert_true(GET(to, "age", double) < 20);
+    assert_true(reaches(to, "flag", 1, from));
+    testbed_end(from);
+    testbed_end(to);
+}
+
+static void is_patient_without_a_peer(void **state)
+{
+    (void)state;
+    struct fl_block *from = publisher((struct node){"state", "alone", "1", NULL, NULL});
+    struct fl_block *to = subscriber((struct node){"state", "another", "1", NULL, NULL});
+    assert_true(reaches(from, "written", 5, to));
+    assert_int_equal(GET(from, "peers", uint32_t), 0);
+    assert_int_equal(GET(to, "flag", uint8_t), 0);
+    testbed_end(from);
+    testbed_end(to);
+}
+
+/* DDS cannot be had: the task runs, and its flags say so. */
+static void runs_on_without_dds(void **state)
+{
+    (void)state;
+    setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><General><NoSuchOption/></General></Domain></CycloneDDS>", 1);
+    struct fl_block *from = publisher((struct node){"state", "s", "1", NULL, NULL});
+    struct fl_block *to = subscriber((struct node){"state", "s", "1", NULL, NULL});
+    for (int i = 0; i < 20; i++) {
+        step(from);
+        step(to);
+    }
+    assert_int_equal(GET(from, "written", uint32_t), 0);
+    assert_int_equal(GET(to, "flag", uint8_t), 0);
+    testbed_end(from);
+    testbed_end(to);
+    configure_dds("auto");
+}
+
+/* --- two processes --- */
+
+static void publish_for_ever(double first)
+{
+    struct fl_block *from = publisher((struct node){"state", "far", "7", "reliability", "reliable"});
+    *(double *)testbed_input(from, "state") = first;
+    for (;;) {
+        step(from);
+        poll(NULL, 0, PERIOD_MS);
+    }
+}
+
+static void passes_between_processes(void **state)
+{
+    (void)state;
+    pid_t child = fork();
+    assert_true(child >= 0);
+    if (child == 0)
+        publish_for_ever(4.5);
+    struct fl_block *to = subscriber((struct node){"state", "far", "7", NULL, NULL});
+    bool heard = reaches(to, "flag", 1, NULL);
+    kill(child, SIGKILL);
+    waitpid(child, NULL, 0);
+    assert_true(heard);
+    assert_near(*(const double *)testbed_output(to, "state"), 4.5, 0);
+    to->release_ns = fl_now_ns() + INT64_C(31000000000);
+    assert_int_equal(testbed_step(to), FL_OK);
+    assert_int_equal(GET(to, "flag", uint8_t), 0);
+    testbed_end(to);
+}
+
+/* Whether a UDP port of this computer is bound. */
+static bool bound(unsigned port)
+{
+    char line[256];
+    bool found = false;
+    FILE *file = fopen("/proc/net/udp", "r");
+    assert_non_null(file);
+    while (fgets(line, sizeof line, file)) {
+        unsigned here;
+        if (sscanf(line, " %*d: %*8x:%x", &here) == 1 && here == port)
+            found = true;
+    }
+    fclose(file);
+    return found;
+}
+
+/* $CYCLONEDDS_URI is obeyed: a fixed index gives the ports of that index (DDSI-RTPS 2.5, 9.6.2.3), which `auto` and
+ * Cyclone's own default do not. */
+static void the_configuration_is_obeyed(void **state)
+{
+    (void)state;
+    unsigned base = 7400 + 250 * (unsigned)atoi(domain) + 10;
+    configure_dds("9");
+    struct fl_block *from = publisher((struct node){"state", "s", "1", NULL, NULL});
+    assert_true(reaches(from, "written", 1, NULL));
+    assert_true(bound(base + 2 * 9));
+    assert_false(bound(base));
+    testbed_end(from);
+    assert_false(bound(base + 2 * 9));
+    configure_dds("auto");
+    from = publisher((struct node){"state", "s", "1", NULL, NULL});
+    assert_true(reaches(from, "written", 1, NULL));
+    assert_true(bound(base));
+    testbed_end(from);
+}
+
+static void steps_never_block(void **state)
+{
+    (void)state;
+    struct fl_block *from = publisher((struct node){"state", "s", "1", NULL, NULL});
+    struct fl_block *to = subscriber((struct node){"state", "s", "1", NULL, NULL});
+    assert_true(reaches(to, "flag", 1, from));
+    steps_under_seccomp(from, 20); /* more than its ring holds */
+    steps_under_seccomp(to, 5);
+    testbed_end(from);
+    testbed_end(to);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(passes_between_processes), /* first: fork before DDS has threads */
+        cmocka_unit_test(passes_a_state),
+        cmocka_unit_test(passes_each_type),
+        cmocka_unit_test(hears_one_robot),
+        cmocka_unit_test(takes_no_other_length),
+        cmocka_unit_test(qualities_are_asked_for),
+        cmocka_unit_test(a_missed_deadline_is_no_good),
+        cmocka_unit_test(is_patient_without_a_peer),
+        cmocka_unit_test(runs_on_without_dds),
+        cmocka_unit_test(the_configuration_is_obeyed),
+        cmocka_unit_test(steps_never_block),
+    };
+    snprintf(domain, sizeof domain, "%d", 1 + getpid() % 200);
+    configure_dds("auto");
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}

@@ -1,0 +1,249 @@
+"""The blocks with a serial port, run as on a robot, against emulated devices that behave and misbehave."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from images.builder import paths
+from tests.emulators.dsp3000 import Dsp3000, Format
+from tests.emulators.micromag3 import MicroMag3
+from tests.emulators.oceanserver import Battery, OceanServer
+from tests.emulators.serial_line import Faults, SerialLine
+from tests.emulators.urg import Urg
+
+TIMEOUT = 60.0
+"""Until something that is waited for is given up: far more than it takes, because the machine may be busy."""
+
+Row = dict[str, Any]
+
+
+@pytest.fixture
+def flotilla_run() -> Path:
+    return paths.BUILD / "runtime" / "flotilla-run"
+
+
+class Run:
+    """A task that runs, and the rows that it prints, one for each step."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def rows(self) -> Iterator[Row]:
+        assert self._process.stdout
+        end = time.monotonic() + TIMEOUT
+        for line in self._process.stdout:
+            assert time.monotonic() < end, f"in vain; the last row is {line}"
+            row = json.loads(line)
+            yield {name.removeprefix("sensor."): value for name, value in row.items()}
+        pytest.fail("the task has ended")
+
+    def until(self, condition: Callable[[Row], object]) -> Row:
+        """The next row of which it is true."""
+        return next(row for row in self.rows() if condition(row))
+
+
+@contextmanager
+def running(
+    binary: Path, directory: Path, line: SerialLine, block: str, *outputs: str, **parameters: Any
+) -> Iterator[Run]:
+    """Run a task of one block every 10 ms, or as often as a busy machine can, and watch it."""
+    written = {"device": line.path, **parameters}
+    task = directory / "task.yml"
+    task.write_text(
+        "period: 10 ms\npriority: 0\noverrun: skip\noverruns: 0\nblocks:\n  sensor:\n"
+        f"    type: {block}\n    parameters: {json.dumps(written)}\n"
+    )
+    watched = ",".join(f"sensor.{output}" for output in (*outputs, "flag", "age", "sequence"))
+    with subprocess.Popen([binary, task, "--watch", watched], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield Run(process)
+        finally:
+            process.terminate()
+            process.communicate(timeout=TIMEOUT)
+
+
+def good(row: Row) -> bool:
+    return bool(row["flag"])
+
+
+def bad(row: Row) -> bool:
+    return not row["flag"]
+
+
+@pytest.mark.parametrize(("format", "baud"), [("text", 38400), ("words", 115200)])
+def test_gyro_through_faults_and_unplugging(flotilla_run: Path, tmp_path: Path, format: Format, baud: int) -> None:
+    gyro = Dsp3000(lambda seconds: 90.0, format)
+    # The timeout is long, so that a busy machine is not taken for a fault; the flag must fall by what is wrong.
+    parameters = {"baud": baud, "format": format, "timeout": 5, "positive": "counterclockwise"}
+    with SerialLine(gyro) as line, running(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run:
+        row = run.until(good)
+        assert row["rate"] == pytest.approx(-math.pi / 2, abs=0.01)
+        assert run.until(lambda later: later["sequence"] > row["sequence"] + 50)["age"] < 5
+
+        gyro.valid = False
+        held = run.until(bad)["rate"]
+        assert held == pytest.approx(-math.pi / 2, abs=0.01)
+        gyro.valid = True
+        run.until(good)
+        gyro.rate = lambda seconds: 380.0  # beyond full scale
+        run.until(bad)
+        gyro.rate = lambda seconds: 10.0
+        assert run.until(good)["rate"] == pytest.approx(math.radians(-10), abs=0.01)
+
+        line.unplug()
+        run.until(bad)
+        line.replug()
+        run.until(good)
+
+        line.faults = Faults(silence=True)
+        assert run.until(bad)["age"] > 5
+        line.faults = Faults()
+        run.until(good)
+
+
+@pytest.mark.parametrize(
+    ("faults", "wrong"),
+    [
+        (Faults(garbage=0.3), 0.05),  # of random words of the right length, parity lets some pass
+        (Faults(half=0.3), 0),
+        (Faults(corrupt=0.3), 0),
+        (Faults(burst=50), 0),
+    ],
+    ids=["garbage", "half", "corrupt", "burst"],
+)
+def test_gyros_words_survive_faults(flotilla_run: Path, tmp_path: Path, faults: Faults, wrong: float) -> None:
+    """A third of the words is spoilt, and what comes is what was measured."""
+    gyro = Dsp3000(lambda seconds: 90.0, "words", noise=0)
+    parameters = {"baud": 115200, "format": "words", "timeout": 5}
+    with (
+        SerialLine(gyro, faults=faults, seed=7) as line,
+        running(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run,
+    ):
+        rates: dict[int, float] = {}  # by sequence: a step may see the same measurement again
+        while len(rates) < 100:
+            row = run.until(good)
+            rates[row["sequence"]] = row["rate"]
+    assert sum(rate != pytest.approx(math.pi / 2, abs=1e-5) for rate in rates.values()) <= wrong * len(rates)
+
+
+def test_gyro_counts_increments_although_its_rate_beats_against_the_tasks(flotilla_run: Path, tmp_path: Path) -> None:
+    gyro = Dsp3000(lambda seconds: 90.0, noise=0)
+    with (
+        SerialLine(gyro) as line,
+        running(flotilla_run, tmp_path, line, "dsp3000", "increment", mode="incremental", timeout=5) as run,
+    ):
+        first = run.until(good)
+        turned = 0.0
+        for row in run.rows():
+            assert row["flag"]
+            turned += row["increment"]
+            if row["sequence"] >= first["sequence"] + 100:
+                expected = (row["sequence"] - first["sequence"]) * math.radians(90) * 0.0102
+                assert turned == pytest.approx(expected, rel=1e-3)
+                break
+
+
+def test_wrong_baud_is_never_good(flotilla_run: Path, tmp_path: Path) -> None:
+    with SerialLine(Dsp3000(lambda seconds: 90.0)) as line:
+        with running(flotilla_run, tmp_path, line, "dsp3000", "rate", baud=57600, timeout=5) as run:
+            sent = line.sent
+            for row in run.rows():
+                assert not row["flag"]
+                if line.sent > sent + 100:
+                    break
+        with running(flotilla_run, tmp_path, line, "dsp3000", "rate", baud=38400, timeout=5) as run:
+            run.until(good)
+
+
+def test_magnetometer(flotilla_run: Path, tmp_path: Path) -> None:
+    compass = MicroMag3(noise=0)
+    with (
+        SerialLine(compass) as line,
+        running(flotilla_run, tmp_path, line, "micromag3", "heading", "field", "error", pollfreq=16, timeout=3) as run,
+    ):
+        row = run.until(good)
+        assert row["heading"] == pytest.approx(math.radians(194.74))
+        assert row["field"] == [-106, -403, 98]
+        assert compass.pollfreq == 16
+        compass.error = 0x200
+        assert run.until(bad)["error"] == 0x200
+        compass.error = 0
+        run.until(good)
+        compass.sums = "unknown"  # wrong checksums: the value grows stale
+        assert run.until(bad)["age"] > 3
+        compass.sums = "xor"
+        run.until(good)
+        line.unplug()
+        run.until(bad)
+        line.replug()
+        run.until(good)
+
+
+def test_magnetometer_with_unknown_checksums(flotilla_run: Path, tmp_path: Path) -> None:
+    parameters = {"mode": "poll", "checksum": "none", "timeout": 5}
+    with (
+        SerialLine(MicroMag3(noise=0, sums="unknown")) as line,
+        running(flotilla_run, tmp_path, line, "micromag3", "heading", **parameters) as run,
+    ):
+        first = run.until(good)["sequence"]
+        run.until(lambda row: row["sequence"] > first + 3)
+
+
+def test_batteries(flotilla_run: Path, tmp_path: Path) -> None:
+    controller = OceanServer({1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}, charging=4)
+    with (
+        SerialLine(controller) as line,
+        running(
+            flotilla_run, tmp_path, line, "oceanserver", "charge", "present", "charging", "voltage", "current",
+            "temperature", "charges", timeout=4,
+        ) as run,
+    ):  # fmt: skip
+        row = run.until(lambda row: row["flag"] and row["charges"][2])
+        assert row["charge"] == pytest.approx(0.6)
+        assert (row["present"], row["charging"]) == (5, 4)
+        assert row["voltage"][:3] == pytest.approx([16.661, 0, 15.5])
+        assert row["current"][:3] == pytest.approx([-0.02, 0, 1.25])
+        assert row["temperature"][:3] == pytest.approx([296.4, 0, 296.4])
+        assert row["charges"][:3] == pytest.approx([0.5, 0, 0.7])
+        line.unplug()
+        run.until(bad)
+        line.replug()
+        run.until(good)
+        line.faults = Faults(corrupt=1)
+        assert run.until(bad)["age"] > 4
+
+
+@pytest.mark.parametrize("mode", ["stream", "poll"])
+def test_laser_scanner(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
+    scanner = Urg(lambda step, seconds: 7 if step == 50 else 1000 + step, old=True, noise=0)
+    parameters = {"first_step": 44, "last_step": 143, "mode": mode, "timeout": 5}
+    with SerialLine(scanner) as line:
+        with running(flotilla_run, tmp_path, line, "urg", "ranges", "timestamp", **parameters) as run:
+            row = run.until(good)
+            assert len(row["ranges"]) == 100
+            assert row["ranges"][6] is None  # an error code: not a number
+            expected = [(1000 + step) / 1000 for step in range(44, 144)]
+            assert row["ranges"][7:] == pytest.approx(expected[7:])
+            run.until(lambda later: later["timestamp"] > row["timestamp"])
+            line.faults = Faults(corrupt=1)
+            assert run.until(bad)["age"] > 5
+            line.faults = Faults()
+            run.until(good)
+            line.unplug()
+            run.until(bad)
+            line.replug()
+            run.until(good)
+            assert scanner.laser
+        end = time.monotonic() + TIMEOUT
+        while scanner.laser:  # the task has ended, and said so
+            assert time.monotonic() < end
+            time.sleep(0.01)
