@@ -17,7 +17,7 @@ from images.builder.chroot import Chroot
 
 _PACKAGES = {
     "flotilla-runtime": ("real-time driver runtime of a robot", ["usr/bin", "usr/lib", "lib"], True),
-    "flotilla-runtime-dev": ("headers for blocks of one's own", ["usr/include", "usr/share/pkgconfig"], False),
+    "flotilla-runtime-dev": ("headers for blocks of one's own", ["usr/include", "usr/share"], False),
 }
 """Name, description, which parts of the installation, whether it depends on the libraries."""
 
@@ -28,7 +28,7 @@ def main(tools: str, out: str, architecture: str, epoch: str, depends: str) -> N
     chroot = Chroot(Path(tools), int(epoch))
     chroot.environment |= {"CC": "gcc", "LDFLAGS": "-Wl,--build-id=none", "DESTDIR": "/out/installed"}
     chroot.provide_system(out=out)
-    setup = ["--prefix=/usr", "--libdir=lib", "--buildtype=release", "--strip"]
+    setup = ["--prefix=/usr", "--libdir=lib", "--buildtype=release", "--strip", "-Ddds=enabled", "-Diidc=enabled"]
     chroot.log("meson", "setup", "/out/objects", "/out/source", *setup)
     chroot.log("meson", "compile", "-C", "/out/objects")
     chroot.log("meson", "install", "-C", "/out/objects", "--no-rebuild")

@@ -85,7 +85,9 @@ int main(int argc, char **argv)
             return 2;
         }
     }
-    if (registry_fill(&registry, blocks, stderr))
+    unsigned faults = registry_fill(&registry, blocks, stderr);
+    faults += registry_load_plugins(&registry);
+    if (faults)
         status = 1;
     for (size_t i = 0; i < registry.count && optind == argc; i++)
         printf("%-20s %s\n", registry.types[i]->name, given(registry.types[i]->summary));

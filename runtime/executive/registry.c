@@ -12,6 +12,16 @@ static int by_name(const void *left, const void *right)
     return strcmp((*a)->name, (*b)->name);
 }
 
+static const struct fl_block_type *find(const struct registry *registry, const char *name)
+{
+    const struct fl_block_type wanted = {.name = name}, *key = &wanted;
+    if (!registry->count)
+        return NULL;
+    const struct fl_block_type *const *found =
+        bsearch(&key, registry->types, registry->count, sizeof(*registry->types), by_name);
+    return found ? *found : NULL;
+}
+
 /* What is wrong with a type, or NULL. */
 static const char *fault(const struct registry *registry, const struct fl_block_type *type)
 {
@@ -19,7 +29,7 @@ static const char *fault(const struct registry *registry, const struct fl_block_
         return "it has no name";
     if (!type->step)
         return "it has no step";
-    if (registry_find(registry, type->name))
+    if (find(registry, type->name))
         return "another block has that name";
     for (uint32_t i = 0; i < type->parameter_count; i++) {
         const struct fl_parameter *parameter = &type->parameters[i];
@@ -32,8 +42,9 @@ static const char *fault(const struct registry *registry, const struct fl_block_
 }
 
 static unsigned add(struct registry *registry, const struct fl_block_type *const *types, size_t count,
-                    const char *origin, FILE *out)
+                    const char *origin)
 {
+    FILE *out = registry->out;
     unsigned faults = 0;
     for (size_t i = 0; i < count; i++) {
         const struct fl_block_type *type = types[i];
@@ -57,8 +68,9 @@ static unsigned add(struct registry *registry, const struct fl_block_type *const
     return faults;
 }
 
-static unsigned add_plugin(struct registry *registry, const char *path, FILE *out)
+static unsigned add_plugin(struct registry *registry, const char *path)
 {
+    FILE *out = registry->out;
     union {
         void *symbol;
         const struct fl_block_type *const *(*blocks)(size_t *count);
@@ -76,35 +88,42 @@ static unsigned add_plugin(struct registry *registry, const char *path, FILE *ou
         return 1;
     }
     const struct fl_block_type *const *types = found.blocks(&count);
-    return add(registry, types, count, path, out);
+    return add(registry, types, count, path);
 }
 
-unsigned registry_fill(struct registry *registry, const char *directory, FILE *out)
+unsigned registry_fill(struct registry *registry, const char *plugins, FILE *out)
 {
-    glob_t plugins;
-    char pattern[4096];
     size_t count;
     const struct fl_block_type *const *types = fl_blocks(&count);
-    unsigned faults = add(registry, types, count, "flotilla", out);
-    if (!directory)
-        return faults;
-    snprintf(pattern, sizeof pattern, "%s/*.so", directory);
-    if (glob(pattern, 0, NULL, &plugins) == 0) {
-        for (size_t i = 0; i < plugins.gl_pathc; i++)
-            faults += add_plugin(registry, plugins.gl_pathv[i], out);
-        globfree(&plugins);
+    *registry = (struct registry){.plugins = plugins, .out = out};
+    return add(registry, types, count, "flotilla");
+}
+
+unsigned registry_load_plugins(struct registry *registry)
+{
+    glob_t found;
+    char pattern[4096];
+    unsigned faults = 0;
+    if (!registry->plugins)
+        return 0;
+    snprintf(pattern, sizeof pattern, "%s/*.so", registry->plugins);
+    registry->plugins = NULL;
+    if (glob(pattern, 0, NULL, &found) == 0) {
+        for (size_t i = 0; i < found.gl_pathc; i++)
+            faults += add_plugin(registry, found.gl_pathv[i]);
+        globfree(&found);
     }
     return faults;
 }
 
-const struct fl_block_type *registry_find(const struct registry *registry, const char *name)
+const struct fl_block_type *registry_find(struct registry *registry, const char *name)
 {
-    const struct fl_block_type wanted = {.name = name}, *key = &wanted;
-    if (!registry->count)
-        return NULL;
-    const struct fl_block_type *const *found =
-        bsearch(&key, registry->types, registry->count, sizeof(*registry->types), by_name);
-    return found ? *found : NULL;
+    const struct fl_block_type *found = find(registry, name);
+    if (!found && registry->plugins) {
+        registry_load_plugins(registry);
+        found = find(registry, name);
+    }
+    return found;
 }
 
 /* Levenshtein's distance, for short names. */

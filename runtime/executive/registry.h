@@ -8,13 +8,19 @@
 struct registry {
     const struct fl_block_type **types; /* by name */
     size_t count;
+    const char *plugins; /* a directory of *.so that are loaded when a block is wanted that the program lacks */
+    FILE *out;           /* what is wrong with types and plug-ins */
 };
 
-/* The program's own blocks, then each *.so of `directory` (NULL: none; need not exist). Faulty types and plug-ins are
- * told to `out` and left out; their number is returned. */
-unsigned registry_fill(struct registry *registry, const char *directory, FILE *out);
+/* The program's own blocks. `plugins` may be NULL, or a directory that does not exist. Number of
+ * faulty types, which are left out. */
+unsigned registry_fill(struct registry *registry, const char *plugins, FILE *out);
 
-const struct fl_block_type *registry_find(const struct registry *registry, const char *name);
+/* Load the plug-ins, if they are not loaded yet. Number of those, and of their types, that were faulty and left out. */
+unsigned registry_load_plugins(struct registry *registry);
+
+/* NULL: neither the program nor a plug-in has it. */
+const struct fl_block_type *registry_find(struct registry *registry, const char *name);
 
 /* The name most like `name`, for a message. NULL: none is. */
 const char *registry_nearest(const struct registry *registry, const char *name);

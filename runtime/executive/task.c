@@ -29,7 +29,7 @@ static void *grown(void *memory, size_t bytes)
 
 /* --- blocks --- */
 
-static void make_block(struct building *building, const struct registry *registry, const struct block_entry *entry)
+static void make_block(struct building *building, struct registry *registry, const struct block_entry *entry)
 {
     struct member *member = &building->task->members[building->task->count];
     const struct fl_block_type *type = entry->type ? registry_find(registry, entry->type) : NULL;
@@ -367,7 +367,7 @@ static char *name_of(const char *path)
     return name;
 }
 
-void task_build(struct task *task, const struct registry *registry, struct problems *problems)
+void task_build(struct task *task, struct registry *registry, struct problems *problems)
 {
     struct task_file file;
     struct building building = {.task = task, .file = &file, .problems = problems};

@@ -26,7 +26,7 @@ struct task {
 
 /* Build the task of `problems->file`. All that is wrong goes to `problems`; what is built is usable when there was
  * nothing. Opens no device. */
-void task_build(struct task *task, const struct registry *registry, struct problems *problems);
+void task_build(struct task *task, struct registry *registry, struct problems *problems);
 void task_free(struct task *task);
 
 /* "block.port" or "block.port[2]" of `task`: the signal, its type and its width; NULL with the reason in `reason`. */
