@@ -61,11 +61,6 @@ class Task:
         return self.process.wait(PATIENCE)
 
 
-@pytest.fixture
-def flotilla_run() -> Path:
-    return paths.BUILD / "runtime/flotilla-run"
-
-
 @pytest.fixture(scope="module")
 def udp_can(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shared object that turns CAN sockets into UDP sockets."""

@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from images.builder import paths
 from tests.emulators.dsp3000 import Dsp3000, Format
 from tests.emulators.micromag3 import MicroMag3
 from tests.emulators.oceanserver import Battery, OceanServer
@@ -24,11 +23,6 @@ TIMEOUT = 60.0
 """Until something that is waited for is given up: far more than it takes, because the machine may be busy."""
 
 Row = dict[str, Any]
-
-
-@pytest.fixture
-def flotilla_run() -> Path:
-    return paths.BUILD / "runtime" / "flotilla-run"
 
 
 class Run:

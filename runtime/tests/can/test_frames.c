@@ -41,7 +41,7 @@ static void receives_the_newest(void **state)
     assert_int_equal(GET(block, "sequence", uint32_t), 0);
     put(0x123, 8, "abcdefgh");
     put(0x123, 3, "xyz");
-    block->release_ns = fl_now_ns(); /* from here on the test's time: no matter how fast the computer is */
+    block->release_ns = fl_now_ns() + 1000000000; /* well after the arrival, however slow the computer is */
     assert_int_equal(testbed_step(block), FL_OK);
     assert_memory_equal(testbed_output(block, "data"), "xyz\0\0\0\0\0", 8);
     assert_int_equal(GET(block, "length", uint8_t), 3);
@@ -49,7 +49,7 @@ static void receives_the_newest(void **state)
     assert_int_equal(GET(block, "flag", uint8_t), 1);
     assert_int_equal(GET(block, "sequence", uint32_t), 2);
     double age = GET(block, "age", double);
-    assert_true(age >= 0.01);
+    assert_true(age > 0 && age < 2);
     assert_int_equal(testbed_step(block), FL_OK); /* nothing new: it ages by a period */
     assert_int_equal(testbed_step(block), FL_OK);
     assert_near(GET(block, "age", double), age + 0.02, 1e-9);
@@ -57,19 +57,25 @@ static void receives_the_newest(void **state)
     hub_close();
 }
 
-/* The stamp is of the arrival in the kernel, not of the step that fetched the frame. */
+/* The stamp is of the arrival in the kernel, not of the step that fetched the frame. Only the kernel knows when it has
+ * begun to stamp after a socket has asked for it; until then it gives the time of the fetch. */
 static void ages_from_the_kernels_stamp(void **state)
 {
     (void)state;
+    enum { ATTEMPTS = 1000 };
+    double age = 0;
     hub_open();
     struct fl_block *block = receiver("0x123", "0x7FF", "false");
-    put(0x123, 1, "a");
-    int64_t put_ns = fl_now_ns();
-    while (fl_now_ns() - put_ns < 5000000)
-        ;
-    block->release_ns = fl_now_ns() - block->period_ns;
-    assert_int_equal(testbed_step(block), FL_OK);
-    assert_true(GET(block, "age", double) >= 0.005);
+    for (int attempt = 0; attempt < ATTEMPTS && age < 0.005; attempt++) {
+        put(0x123, 1, "a");
+        int64_t put_ns = fl_now_ns();
+        while (fl_now_ns() - put_ns < 5000000)
+            ;
+        block->release_ns = fl_now_ns() - block->period_ns;
+        assert_int_equal(testbed_step(block), FL_OK);
+        age = GET(block, "age", double);
+    }
+    assert_true(age >= 0.005);
     testbed_end(block);
     hub_close();
 }
