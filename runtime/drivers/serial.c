@@ -9,6 +9,7 @@
 #include <stdatomic.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/file.h>
 #include <sys/ioctl.h>
 #include <unistd.h>
 
@@ -53,11 +54,15 @@ struct fl_serial {
     _Atomic bool connected;
 };
 
-/* The exclusive mode would outlive the descriptor where something else keeps the terminal alive. */
-static void close_port(int fd)
+/* A lock rather than TIOCEXCL: that outlives a process that was killed, where something else keeps the port open, as
+ * the robot does for its interrupt thread's sake. */
+static int lock_port(int fd)
 {
-    ioctl(fd, TIOCNXCL);
-    close(fd);
+    if (flock(fd, LOCK_EX | LOCK_NB) == 0)
+        return 0;
+    if (errno == EWOULDBLOCK)
+        errno = EBUSY;
+    return -1;
 }
 
 int fl_serial_open(const struct fl_serial_settings *settings)
@@ -74,14 +79,14 @@ int fl_serial_open(const struct fl_serial_settings *settings)
     raw.c_ispeed = raw.c_ospeed = (speed_t)settings->baud;
     struct termios2 set;
     int error = 0;
-    if (ioctl(fd, TIOCEXCL) < 0 || ioctl(fd, TCSETS2, &raw) < 0 || ioctl(fd, TCGETS2, &set) < 0 ||
+    if (lock_port(fd) < 0 || ioctl(fd, TCSETS2, &raw) < 0 || ioctl(fd, TCGETS2, &set) < 0 ||
         ioctl(fd, TCFLSH, TCIOFLUSH) < 0)
         error = errno;
     /* A driver takes the nearest rate it has, or the one before, and says nothing. */
     else if (llabs((long long)set.c_ospeed - settings->baud) > settings->baud / RATE_TOLERANCE)
         error = ERANGE;
     if (error) {
-        close_port(fd);
+        close(fd);
         errno = error;
         return -1;
     }
@@ -206,7 +211,7 @@ static void run(struct fl_driver *driver, void *context)
         } else if (send_queued(serial, driver, fd)) {
             send_request(serial, driver, fd, FL_SERIAL_CLOSING);
         }
-        close_port(fd);
+        close(fd);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);
 }
 
