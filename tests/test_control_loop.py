@@ -10,6 +10,7 @@ import json
 import math
 import select
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -267,6 +268,18 @@ def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:
     assert loop.wait_relays(on=False)
     assert loop.unit("Result") == "success"
     loop.robot.shell.run(["sudo", "systemctl", "start", UNIT])
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_every_block_is_on_the_robot(guest: GuestFactory, flotilla_run: Path, number: int) -> None:
+    """Those of plug-ins too, which only load where their libraries are there."""
+    here = subprocess.run(
+        [flotilla_run.with_name("flotilla-blocks")], capture_output=True, text=True, check=True
+    ).stdout
+    there = guest(number).shell.run(["flotilla-blocks"]).stdout
+    names = {line.split()[0] for line in there.splitlines()}
+    assert names >= {line.split()[0] for line in here.splitlines()}
+    assert names >= {"dds-publish", "frame-grabber-iidc", "gain"}
 
 
 def test_task_on_the_other_architecture(guest: GuestFactory) -> None:

@@ -84,7 +84,7 @@ TaskName = Annotated[
     _matching(
         r"[a-z][a-z0-9-]{0,31}",
         "is not a task's name",
-        "a small letter, then small letters, digits or hyphens, such as heading: the file is ansible/tasks/NAME.yml",
+        "a small letter, then small letters, digits or hyphens, such as heading: ansible/control_tasks/heading.yml",
     ),
 ]
 Word = Annotated[str, _matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
@@ -264,7 +264,7 @@ class Robot(Host):
     """Name of the board, a key of `Fleet.boards`."""
     devices: dict[DeviceName, Device] = {}
     tasks: list[TaskName] = []
-    """Control tasks that start with the robot: `ansible/tasks/NAME.yml` each."""
+    """Control tasks that start with the robot: `ansible/control_tasks/NAME.yml` each."""
 
 
 class Fleet(_Model):

@@ -19,7 +19,7 @@ IMAGES = BUILD / "images"
 """Card images with what belongs to them."""
 
 INVENTORY = PROJECT / "ansible" / "inventory"
-TASKS = PROJECT / "ansible" / "tasks"
+TASKS = PROJECT / "ansible" / "control_tasks"
 """Control tasks that the inventory gives to robots."""
 OVERLAY = PROJECT / "rootfs_overlay"
 PACKAGES = PROJECT / "images" / "packages"

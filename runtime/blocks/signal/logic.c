@@ -58,12 +58,16 @@ FL_BLOCK(logic) = {
 
 static const struct fl_port select_inputs[] = {
     {.name = "condition", .type = FL_BOOLEAN, .width = 1, .summary = "which"},
-    {.name = "yes", .type = FL_DOUBLE, .width = 1, .flags = FL_OPTIONAL, .summary = "out while condition is true"},
-    {.name = "no", .type = FL_DOUBLE, .width = 1, .flags = FL_OPTIONAL, .summary = "out while condition is false"},
+    {.name = "then", .type = FL_DOUBLE, .width = 1, .flags = FL_OPTIONAL, .summary = "out while condition is true"},
+    {.name = "otherwise",
+     .type = FL_DOUBLE,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "out while condition is false"},
 };
 
 static const struct fl_port select_outputs[] = {
-    {.name = "out", .type = FL_DOUBLE, .width = 1, .summary = "yes or no; zero for one without a wire"},
+    {.name = "out", .type = FL_DOUBLE, .width = 1, .summary = "one of them; zero for one without a wire"},
 };
 
 static int step_select(struct fl_block *block)

@@ -29,8 +29,8 @@ static void selects(void **state)
     (void)state;
     struct fl_block *select = testbed_block("select", NULL);
     testbed_begin(select);
-    SET(select, "yes", double, 4);
-    SET(select, "no", double, NAN);
+    SET(select, "then", double, 4);
+    SET(select, "otherwise", double, NAN);
     SET(select, "condition", uint8_t, 1);
     assert_int_equal(testbed_step(select), FL_OK);
     assert_near(GET(select, "out", double), 4, 0);
