@@ -68,10 +68,10 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime
+.PHONY: runtime check-runtime fuzz bench-runtime
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
-compile = $(meson) compile -C $1 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
+compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
 runtime: | setup-tests ## the runtime's programs for this computer, in build/runtime
 	$(Q)test -f $(BUILD)/runtime/build.ninja || $(meson) setup $(BUILD)/runtime runtime >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime)
@@ -82,6 +82,21 @@ check-runtime: | setup-tests ## the runtime's unit tests, with AddressSanitizer 
 	    -Db_sanitize=address,undefined -Dbuildtype=debugoptimized >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime-sanitized)
 	$(Q)$(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
+
+fuzz: | setup-tests ## fuzz the runtime's parsers: make fuzz [SECONDS=60], of each; what is found goes to build/found
+	$(Q)images/install-host-packages tests/fuzz-packages.txt
+	$(Q)test -f $(BUILD)/fuzz/build.ninja || CC=clang $(meson) setup $(BUILD)/fuzz runtime -Dtests=true -Dfuzz=true \
+	    -Dbuildtype=debugoptimized >/dev/null
+	$(Q)$(call compile,$(BUILD)/fuzz,fuzzers)
+	$(Q)set -e; for fuzzer in $$(find $(BUILD)/fuzz/tests/fuzz -maxdepth 1 -type f -name 'fuzz_*' | sort); do \
+	    name=$${fuzzer##*/fuzz_}; found=$(BUILD)/found/$$name; known=runtime/tests/fuzz/corpus/$$name; \
+	    mkdir -p $$found; echo "$$name: $(or $(SECONDS),60) s"; \
+	    $$fuzzer -max_total_time=$(or $(SECONDS),60) -max_len=1024 -verbosity=0 -artifact_prefix=$$found- $$found \
+	        $$(test ! -d $$known || echo $$known) 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
+
+bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=5]
+	$(Q)images/install-host-packages runtime/bench/packages.txt
+	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS))
 
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck

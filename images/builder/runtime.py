@@ -16,7 +16,7 @@ from images.builder.lock import read_lock
 SOURCE = paths.PROJECT / "runtime"
 LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libsystemd0", "libyaml-0-2")
 """Packages whose libraries its programs load; robots have them from images/packages/robot.list."""
-_LEFT_OUT = ("tests", "bench")
+_LEFT_OUT = ("bench", "station", "tests")
 """Folders of the source that no package comes from."""
 
 
