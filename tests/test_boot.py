@@ -539,25 +539,16 @@ def test_devices_have_names_and_rates(pentium: RobotGuest, fleet: Fleet) -> None
 EIGHT = [f"COM{number}" for number in range(5, 13)]
 
 
-@pytest.fixture
-def free_ports(pentium: RobotGuest) -> Iterator[RobotGuest]:
-    """The robot while its control tasks do not run, which have their devices to themselves."""
-    units = " ".join(f"flotilla-task@{task}.service" for task in pentium.robot.tasks)
-    sh(pentium, f"systemctl stop {units}" if units else "true")
-    yield pentium
-    sh(pentium, f"systemctl start {units}" if units else "true")
-
-
-def test_eight_port_board_serves_all_ports_at_once(free_ports: RobotGuest, fleet: Fleet) -> None:
+def test_eight_port_board_serves_all_ports_at_once(pentium: RobotGuest, fleet: Fleet) -> None:
     """Both ways on every port while they share interrupts, each byte to the right connector."""
-    ports = {name: free_ports.board.ports[name].tty for name in EIGHT}
-    uarts = _uarts(free_ports)
+    ports = {name: pentium.board.ports[name].tty for name in EIGHT}
+    uarts = _uarts(pentium)
     lines = {name: uarts[tty]["irq"] for name, tty in ports.items()}
     assert len(set(lines.values())) < len(lines), f"no two ports share an interrupt: {lines}"
-    ends = {name: free_ports.machine.port(name) for name in EIGHT}
+    ends = {name: pentium.machine.port(name) for name in EIGHT}
     try:
         with ThreadPoolExecutor() as threads:
-            inside = threads.submit(call, free_ports, exchange, {tty: f"to {name}\n" for name, tty in ports.items()})
+            inside = threads.submit(call, pentium, exchange, {tty: f"to {name}\n" for name, tty in ports.items()})
             outgoing = {name: end.read_until(b"\n").decode() for name, end in ends.items()}
             for name, end in ends.items():
                 end.write(f"from {name}\n".encode())
@@ -592,13 +583,13 @@ def exchange(lines: dict[str, str]) -> dict[str, str]:
     return {name: line.decode() for name, line in received.items()}
 
 
-def test_device_is_read_by_its_name(free_ports: RobotGuest) -> None:
-    (name, device), *_ = free_ports.robot.devices.items()
-    end = free_ports.machine.port(device.port)
+def test_device_is_read_by_its_name(pentium: RobotGuest) -> None:
+    (name, device), *_ = pentium.robot.devices.items()
+    end = pentium.machine.port(device.port)
     try:
-        sh(free_ports, f"timeout 0.5 cat /dev/robot/{name}", check=False)  # what lay there
+        sh(pentium, f"timeout 0.5 cat /dev/robot/{name}", check=False)  # what lay there
         end.write(b"0123456789\r\n" * 20)
-        got = free_ports.shell.run(["timeout", "20", "head", "-c", "240", f"/dev/robot/{name}"], check=False).stdout
+        got = pentium.shell.run(["timeout", "20", "head", "-c", "240", f"/dev/robot/{name}"], check=False).stdout
     finally:
         end.close()
     assert got == "0123456789\r\n" * 20, f"{got!r} arrived at /dev/robot/{name}"

@@ -35,16 +35,15 @@ def test_robots_differ_where_they_should(fleet: Fleet) -> None:
     assert differing == {
         "/etc/chrony/chrony.conf", "/etc/hostname", "/etc/machine-id", "/etc/ssh/ssh_host_ed25519_key",
         "/etc/ssh/ssh_host_ed25519_key.pub", "/etc/systemd/network/10-fleet.network",
-        "/etc/udev/rules.d/70-robot.rules", "/etc/flotilla/tasks/heading.yml",
-        "/etc/systemd/system/sysinit.target.d/tasks.conf",
+        "/etc/udev/rules.d/70-robot.rules",
     }  # fmt: skip
 
 
 def test_tasks_start_with_the_robot(fleet: Fleet) -> None:
     assert "\nWants=flotilla-task@heading.service\n" in _text(
-        fleet, fleet.robots[3], "/etc/systemd/system/sysinit.target.d/tasks.conf"
+        fleet, fleet.robots[1], "/etc/systemd/system/sysinit.target.d/tasks.conf"
     )
-    assert "period: 10 ms" in _text(fleet, fleet.robots[3], "/etc/flotilla/tasks/heading.yml")
+    assert "period: 10 ms" in _text(fleet, fleet.robots[1], "/etc/flotilla/tasks/heading.yml")
 
 
 def test_rendering_repeats(fleet: Fleet) -> None:
