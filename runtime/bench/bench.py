@@ -15,7 +15,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,8 @@ from pathlib import Path
 _NULL = subprocess.DEVNULL
 _PATIENCE_S = 60
 COUNTS = (10, 100, 1000)
+HAL_COUNTS = (10, 100, 400)
+"""Its shared memory has no room for a thousand."""
 PERIOD_NS = 1_000_000
 IDLE_BLOCKS = 100
 """Of the task that shall leave a core idle."""
@@ -96,7 +98,13 @@ def hal(blocks: int, directory: Path) -> Iterator[int]:
     ) as process:
         assert process.stdin
         try:
-            yield _started(process)
+            pid = _started(process)
+            listed = subprocess.run(
+                ["halcmd", "show", "funct"], capture_output=True, text=True, env=environment, check=True
+            )
+            if listed.stdout.count(" scale.") != blocks:
+                raise SystemExit(f"HAL has loaded {listed.stdout.count(' scale.')} of {blocks} functions")
+            yield pid
         finally:
             process.stdin.close()  # it undoes all it has loaded, and ends
 
@@ -121,9 +129,11 @@ def slope_ns(costs: list[Cost]) -> float:
     return (longer.step_ns - shorter.step_ns) / (longer.blocks - shorter.blocks)
 
 
-def measure(run: Callable[[int, Path], AbstractContextManager[int]], seconds: float) -> list[Cost]:
+def measure(
+    run: Callable[[int, Path], AbstractContextManager[int]], counts: Sequence[int], seconds: float
+) -> list[Cost]:
     costs = []
-    for blocks in COUNTS:
+    for blocks in counts:
         with tempfile.TemporaryDirectory() as directory, run(blocks, Path(directory)) as pid:
             costs.append(observe(pid, blocks, seconds))
     return costs
@@ -143,10 +153,10 @@ def main() -> None:
     parser.add_argument("program", type=Path, help="flotilla-run")
     parser.add_argument("--seconds", type=float, default=5, help="for each chain")
     options = parser.parse_args()
-    ours = measure(functools.partial(flotilla, program=options.program), options.seconds)
+    ours = measure(functools.partial(flotilla, program=options.program), COUNTS, options.seconds)
     print(report("flotilla-run", ours), flush=True)
     if shutil.which("halcmd"):
-        theirs = measure(hal, options.seconds)
+        theirs = measure(hal, HAL_COUNTS, options.seconds)
         print(report("LinuxCNC HAL", theirs))
         print(f"ratio: {slope_ns(ours) / slope_ns(theirs):.2f} a block")
     idle = next(cost for cost in ours if cost.blocks == IDLE_BLOCKS)
