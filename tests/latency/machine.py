@@ -72,6 +72,8 @@ class Machine:
     """Kernel command line."""
     disk: Path | None = None
     """A raw image as IDE disk. With one, results do not repeat: the host decides when it answers."""
+    extra: tuple[str, ...] = ()
+    """Further arguments of QEMU, such as devices that the board does not have by itself."""
 
     def run(self, directory: Path, timeout_s: float) -> bytes:
         """What the guest wrote to its last serial connector; `console.log` and `qemu.command` stay in `directory`.
@@ -102,7 +104,7 @@ class Machine:
         argv += ["-chardev", qemu.chardev(last, _file(results))]
         for device in board.qemu.devices:
             argv += ["-device", device]
-        return argv
+        return [*argv, *self.extra]
 
 
 def card_command_line(emulator: Emulator, board: Board, card: Path, console: Path, results: Path) -> list[str]:
