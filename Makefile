@@ -35,6 +35,22 @@ verify: | setup ## build a second time under other circumstances and compare to 
 size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size --robot $(call need,ROBOT)
 
+##@ Fleet
+.PHONY: fleet fleet-status fleet-down provision
+fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
+	$(Q)$(PYTHON) -m tests.lab.fleet up $(call need,N)
+
+fleet-status: | setup-tests ## what the guests of the virtual fleet do
+	$(Q)$(PYTHON) -m tests.lab.fleet status
+
+fleet-down: | setup-tests ## end the virtual fleet
+	$(Q)$(PYTHON) -m tests.lab.fleet down
+
+provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [PLAYBOOK=fleet ARGS=--check]
+	$(Q)cd ansible && PATH="$(abspath $(VENV))/bin:$$PATH" ansible-playbook -i inventory \
+	    $(if $(filter guests,$(ON)),-i $(abspath $(BUILD))/fleet/guests.yml -l $(if $(ROBOT),robot$(ROBOT),guests), \
+	        $(if $(ROBOT),-l robot$(ROBOT))) $(ARGS) $(or $(PLAYBOOK),fleet).yml
+
 ##@ Inputs
 .PHONY: lock check-fleet requirements
 lock: | setup ## resolve the package lists against the mirror: exact versions and hashes
@@ -53,8 +69,9 @@ check: | setup-tests ## lint, types and unit tests, under a minute
 	$(Q)$(VENV)/bin/ruff format --check .
 	$(Q)$(VENV)/bin/ruff check .
 	$(Q)$(VENV)/bin/mypy
+	$(Q)$(VENV)/bin/mypy ansible/library ansible/plugins
 	$(Q)$(call shell_scripts) | xargs shellcheck
-	$(Q)PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/ansible-lint --offline -q ansible
+	$(Q)cd ansible && PATH="$(abspath $(VENV))/bin:$$PATH" ansible-lint --offline -q .
 	$(Q)$(MAKE) check-runtime
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 

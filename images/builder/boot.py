@@ -17,7 +17,7 @@ from images.builder.errors import UserError
 from images.builder.fleet import Board, Network, Robot
 
 RUN = paths.BUILD / "run"
-"""What `make boot` tells `make ssh`: the port, in a file that means something only while locked."""
+"""What `make boot` and `make fleet` tell `make ssh`: the port, in a file that means something only while locked."""
 
 
 def boot(robot: Robot, board: Board, network: Network, image: Path, station: IPv4Address | None = None) -> None:
@@ -28,7 +28,7 @@ def boot(robot: Robot, board: Board, network: Network, image: Path, station: IPv
     if not image.exists():
         raise UserError(f"{paths.shown(image)} is missing; build it: make image ROBOT={robot.number}")
     qemu.program(board)  # complain about a missing QEMU before anything is left behind
-    with _announced(robot) as port:
+    with announced(robot, _free_port()) as port:
         overlay = RUN / f"{robot.name}.qcow2"
         qemu.make_overlay(image, overlay, qemu.CARD_BYTES)
         link = qemu.UserLink(
@@ -60,11 +60,11 @@ def boot(robot: Robot, board: Board, network: Network, image: Path, station: IPv
 
 
 def ssh(robot: Robot, command: Sequence[str] = ()) -> None:
-    """Become `ssh` to the robot's guest when `make boot` runs, else to the robot."""
+    """Become `ssh` to the robot's guest when one runs, else to the robot."""
     port = forwarded_port(robot)
     argv = [*ssh_command(robot), *command]
     progress.command(argv)
-    sys.stderr.write(f"{robot.name}: {f'guest of make boot, port {port}' if port else f'robot at {robot.address}'}\n")
+    sys.stderr.write(f"{robot.name}: {f'guest on port {port}' if port else f'robot at {robot.address}'}\n")
     sys.stderr.flush()
     try:
         os.execvp("ssh", argv)
@@ -73,7 +73,7 @@ def ssh(robot: Robot, command: Sequence[str] = ()) -> None:
 
 
 def ssh_command(robot: Robot) -> list[str]:
-    """`ssh` to the robot's guest when `make boot` runs, else to the robot."""
+    """`ssh` to the robot's guest when one runs, else to the robot."""
     port = forwarded_port(robot)
     return ["ssh", *ssh_options(robot), *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)])]
 
@@ -99,7 +99,7 @@ def ssh_options(robot: Robot) -> list[str]:
 
 
 def forwarded_port(robot: Robot) -> int | None:
-    """The loopback port of the robot's guest, or None when no `make boot` of it runs."""
+    """The loopback port of the robot's guest, or None when none runs."""
     try:
         record = _record(robot).open()
     except FileNotFoundError:
@@ -109,7 +109,7 @@ def forwarded_port(robot: Robot) -> int | None:
             fcntl.flock(record, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return int(record.read())
-    return None  # nobody holds the lock: left behind by a `make boot` that ended
+    return None  # nobody holds the lock: left behind by a guest that ended
 
 
 DIE_WITH_PARENT = ["setpriv", "--pdeathsig", "KILL"]
@@ -117,8 +117,8 @@ DIE_WITH_PARENT = ["setpriv", "--pdeathsig", "KILL"]
 
 
 @contextmanager
-def _announced(robot: Robot) -> Iterator[int]:
-    """A free loopback port, recorded for `make ssh` while the body runs.
+def announced(robot: Robot, port: int) -> Iterator[int]:
+    """Record for `make ssh` that the robot's guest listens on a loopback port, while the body runs.
 
     The file is never removed, since only its lock means something, and that ends with this process in whatever way.
     """
@@ -127,9 +127,8 @@ def _announced(robot: Robot) -> Iterator[int]:
         try:
             fcntl.flock(record, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            remedy = f"leave it with Ctrl-A X, or use make ssh ROBOT={robot.number}"
-            raise UserError(f"make boot ROBOT={robot.number} runs already; {remedy}") from None
-        port = _free_port()
+            remedy = f"leave it with Ctrl-A X or make fleet-down, or use make ssh ROBOT={robot.number}"
+            raise UserError(f"{robot.name} runs already as a guest; {remedy}") from None
         record.truncate(0)
         record.write(str(port))
         record.flush()

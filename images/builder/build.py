@@ -71,7 +71,7 @@ def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
     """Refuse what the robots themselves would refuse, all of it at once."""
     problems = []
     for robot in robots:
-        for path, (content, _) in identity.render(fleet, robot).items() if robot.tasks else ():
+        for path, (content, _) in identity.render(fleet, robot).items() if robot.control_tasks else ():
             if path.parent == identity.TASKS:
                 try:
                     runtime.check_task(path.stem, content)

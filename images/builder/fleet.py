@@ -263,7 +263,7 @@ class Robot(Host):
     board: str
     """Name of the board, a key of `Fleet.boards`."""
     devices: dict[DeviceName, Device] = {}
-    tasks: list[TaskName] = []
+    control_tasks: list[TaskName] = []
     """Control tasks that start with the robot: `ansible/control_tasks/NAME.yml` each."""
 
 

@@ -117,7 +117,7 @@ def render(fleet: Fleet, robot: Robot) -> dict[PurePosixPath, tuple[bytes, int]]
             raise UserError(f"{paths.shown(template)}: {error}") from error
         if content.strip():
             files[PurePosixPath("/") / name.with_suffix("")] = (content, _PRIVATE.get(template.name, 0o644))
-    return files | {TASKS / f"{task}.yml": (_task(task, values), 0o644) for task in robot.tasks}
+    return files | {TASKS / f"{task}.yml": (_task(task, values), 0o644) for task in robot.control_tasks}
 
 
 def _task(name: str, values: dict[str, object]) -> bytes:

@@ -40,7 +40,7 @@ Scope = tuple[str, str]
 
 _HOMES = {"fleet_name": "all", "network": "all", "board": "board_*"}
 """Variables that hosts share, and the one group whose `group_vars/` sets them."""
-_VARIABLES = {"number", "address", "devices", "tasks", *_HOMES}
+_VARIABLES = {"number", "address", "devices", "control_tasks", *_HOMES}
 """The variables read here. Any others are Ansible's and its roles'."""
 
 _SYNTAX = "(syntax)"
@@ -119,7 +119,9 @@ def _ansible_inventory(directory: Path) -> str:
     }
     argv = [str(program), "-i", str(directory), "--list"]
     try:
-        done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            argv, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+        )
     except FileNotFoundError:
         raise UserError(f"{program}: not installed; run `make setup`") from None
     if done.returncode:
@@ -420,7 +422,7 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
         findings += [((kind, host), message, remedy) for wrong, message, remedy in faults if wrong]
         member = {"name": host} | {key: variables[key] for key in ("address",) if key in variables}
         if kind == "robots":
-            member |= {key: variables[key] for key in ("number", "devices", "tasks") if key in variables}
+            member |= {key: variables[key] for key in ("number", "devices", "control_tasks") if key in variables}
             member["board"] = own[0].removeprefix("board_") if own else ""
         raw[kind][host] = member
         if len(own) == 1:  # of several boards Ansible has merged one
@@ -555,9 +557,9 @@ def _devices(raw: dict[str, Any]) -> Iterator[Finding]:
 def _tasks(raw: dict[str, Any]) -> Iterator[Finding]:
     there = sorted(path.stem for path in paths.TASKS.glob("*.yml"))
     for name, robot in raw["robots"].items():
-        tasks = robot.get("tasks")
+        tasks = robot.get("control_tasks")
         named = {
-            ("robots", name, "tasks", index): task
+            ("robots", name, "control_tasks", index): task
             for index, task in enumerate(tasks if isinstance(tasks, list) else ())
             if isinstance(task, str)
         }

@@ -103,9 +103,13 @@ CASES = {
     "device's key": Case(
         ROBOTS, PORT3, PORT3.replace("port:", "prot:"), "robot3.devices.gyro.prot", "not known…mean port?", also=1
     ),
-    "no such task": Case(ROBOTS, "[heading]", "[haeding]", "robot1.tasks.0", "no file…one of heading", "haeding"),
-    "task twice": Case(ROBOTS, "[heading]", "[heading, heading]", "robot1.tasks.1", "already…once", "heading"),
-    "task's name": Case(ROBOTS, "[heading]", "[Head.ing]", "robot1.tasks.0", "not a task's name", "Head", also=1),
+    "no such task": Case(
+        ROBOTS, "[heading]", "[haeding]", "robot1.control_tasks.0", "no file…one of heading", "haeding"
+    ),
+    "task twice": Case(ROBOTS, "[heading]", "[heading, heading]", "robot1.control_tasks.1", "already…once", "heading"),
+    "task's name": Case(
+        ROBOTS, "[heading]", "[Head.ing]", "robot1.control_tasks.0", "not a task's name", "Head", also=1
+    ),
     "devices empty": Case(
         ROBOTS, "10.42.0.4", "10.42.0.4\n          devices:", "robot4.devices", "is not a mapping…or remove it"
     ),

@@ -206,9 +206,9 @@ def test_boot_without_image(build: Path) -> None:
 
 def test_port_is_known_only_while_make_boot_runs(build: Path) -> None:
     assert boot.forwarded_port(ROBOT) is None
-    with boot._announced(ROBOT) as port:
+    with boot.announced(ROBOT, 40022) as port:
         assert boot.forwarded_port(ROBOT) == port
-        with pytest.raises(UserError, match="runs already"), boot._announced(ROBOT):
+        with pytest.raises(UserError, match="runs already"), boot.announced(ROBOT, 40023):
             pass
         assert boot.forwarded_port(ROBOT) == port
     assert boot.forwarded_port(ROBOT) is None
@@ -235,7 +235,7 @@ def test_ssh_pins_the_host_key(build: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_ssh_prefers_the_guest(build: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with boot._announced(ROBOT) as port:
+    with boot.announced(ROBOT, 40022) as port:
         assert ssh_command(monkeypatch)[-4:] == ["-p", str(port), "127.0.0.1", "uptime"]
 
 

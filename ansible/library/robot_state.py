@@ -1,0 +1,248 @@
+#!/usr/bin/python3
+"""What a robot is, beside what it should be: the files it has of its own, and what it runs. It changes nothing.
+
+A robot's root is common to all; what it has of its own lies in the layer above /etc on its data partition. So drift is
+what differs there from what the image brought, and nothing else needs to be looked at.
+
+This module reads its arguments as text and does without `AnsibleModule`, whose import takes an emulated Pentium III six
+seconds; this whole module takes it two or three.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import json
+import os
+import re
+import signal
+import socket
+import stat
+import subprocess
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # without an import: it takes time
+    from collections.abc import Iterator
+    from typing import Any
+
+ARGUMENTS = r"""<<INCLUDE_ANSIBLE_MODULE_JSON_ARGS>>"""
+LAYER = "/data/etc"
+SHOWN_BYTES = 65536
+UNIT_PROPERTIES = "Id,Type,ActiveState,SubState,Result,ConditionResult,RemainAfterExit,NRestarts,UnitFileState"
+
+
+def output(*argv: str) -> str:
+    """Standard output of a program, empty where it fails."""
+    return subprocess.run(argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False).stdout
+
+
+def read(path: str) -> str:
+    with open(path) as file:
+        return file.read()
+
+
+class Root:
+    """The root below the layers, seen through the mounts of a process that has it mounted once more."""
+
+    def __init__(self) -> None:
+        script = "mount --bind / /mnt && echo ready && exec sleep 60"
+        argv = ["unshare", "--mount", "sh", "-c", script]
+        self._process = subprocess.Popen(argv, stdout=subprocess.PIPE)
+        if not self._process.stdout or self._process.stdout.readline() != b"ready\n":
+            raise OSError("cannot look below the layers of /etc")
+
+    def close(self) -> None:
+        self._process.send_signal(signal.SIGKILL)
+        self._process.wait()
+
+    def path(self, path: str) -> str:
+        return f"/proc/{self._process.pid}/root/mnt{path}"
+
+
+class Found:
+    """A file as it is."""
+
+    def __init__(self, kind: int, mode: int, owner: tuple[int, int], content: bytes) -> None:
+        self.kind, self.mode, self.owner, self.content = kind, mode, owner, content
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Found) and vars(self) == vars(other)
+
+    __hash__ = None  # type: ignore[assignment]  # nobody asks
+
+
+def described(path: str) -> Found | None:
+    """What there is; None where there is nothing."""
+    try:
+        found = os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    content = b""
+    if stat.S_ISLNK(found.st_mode):
+        content = os.readlink(path).encode()
+    elif stat.S_ISREG(found.st_mode):
+        with open(path, "rb") as file:
+            content = file.read()
+    return Found(stat.S_IFMT(found.st_mode), stat.S_IMODE(found.st_mode), (found.st_uid, found.st_gid), content)
+
+
+def is_whiteout(path: str) -> bool:
+    found = os.lstat(path)
+    return stat.S_ISCHR(found.st_mode) and found.st_rdev == 0
+
+
+def is_opaque(directory: str) -> bool:
+    """Whether a directory was removed and made anew, which hides what the root has in it."""
+    try:
+        return os.getxattr(directory, "trusted.overlay.opaque") == b"y"
+    except OSError:
+        return False
+
+
+def shown(found: Found | None) -> str:
+    """A file's content as text for a person; nothing of a file that is not for everyone."""
+    if found is None or found.kind == stat.S_IFDIR:
+        return ""
+    if found.kind == stat.S_IFREG and not found.mode & stat.S_IROTH:
+        return "(private)\n"
+    text = found.content[:SHOWN_BYTES].decode(errors="replace")
+    return text if text.endswith("\n") or not text else text + "\n"
+
+
+def below(directory: str) -> Iterator[str]:
+    """All paths of files and links below a directory."""
+    for place, directories, names in os.walk(directory):
+        for name in [*names, *(each for each in directories if os.path.islink(os.path.join(place, each)))]:
+            yield os.path.join(place, name)
+
+
+def drift(expected: dict[str, dict[str, Any]], keep: list[str]) -> list[dict[str, str]]:
+    """Files that are not as they should be: path, what to do (`write`, `remove`, `restore`), why, and the content."""
+    found: list[dict[str, str]] = []
+
+    def add(path: str, action: str, why: str, before: Found | None) -> None:
+        found.append({"path": path, "action": action, "why": why, "before": shown(before)})
+
+    for path, wanted in sorted(expected.items()):
+        there = described(path)
+        if there is None:
+            add(path, "write", "is missing", None)
+        elif there.kind != stat.S_IFREG or hashlib.sha256(there.content).hexdigest() != wanted["sha256"]:
+            add(path, "write", "has another content", there)
+        elif there.mode != wanted["mode"] or there.owner != (0, 0):
+            add(path, "write", f"has mode {there.mode:o} and owner {there.owner[0]}", there)
+    layer = [path[len(LAYER) - len("/etc") :] for path in below(LAYER)]
+    others = sorted(path for path in layer if path not in expected and path not in keep)
+    hidden = [place[len(LAYER) - len("/etc") :] for place, _, _ in os.walk(LAYER) if is_opaque(place)]
+    if not others and not hidden:
+        return found
+    root = Root()
+    try:
+        for path in others:
+            below_layer, there = described(root.path(path)), described(path)
+            if is_whiteout(LAYER + path[len("/etc") :]):
+                add(path, "restore", "was removed", None)
+            elif below_layer is None:
+                add(path, "remove", "does not belong to the robot", there)
+            elif there != below_layer:
+                add(path, "restore", "differs from the image", there)
+        for directory in hidden:
+            prefix = len(root.path(""))
+            for path in (each[prefix:] for each in below(root.path(directory))):
+                if path not in expected and not os.path.lexists(path):
+                    add(path, "restore", "was removed", None)
+    finally:
+        root.close()
+    return found
+
+
+def sysctl_drift() -> list[list[str]]:
+    """Settings of the kernel that are not what /etc/sysctl.d says: name, is, should be."""
+    found = []
+    for name in sorted(os.listdir("/etc/sysctl.d")):
+        settings = re.findall(r"^\s*([^#;\s=]+)\s*=\s*(.*?)\s*$", read(f"/etc/sysctl.d/{name}"), re.MULTILINE)
+        for key, wanted in settings:
+            try:
+                there = " ".join(read("/proc/sys/" + key.replace(".", "/")).split())
+            except OSError:
+                there = "(missing)"
+            if there != wanted:
+                found.append([key, there, wanted])
+    return found
+
+
+def firewall_is_loaded() -> bool:
+    """Whether the rules in force are those that the file makes in a network that has none."""
+    made = "nft -f /etc/nftables.conf && nft -s list ruleset"
+    return output("nft", "-s", "list", "ruleset") == output("unshare", "--net", "sh", "-c", made)
+
+
+def units(tasks: list[str]) -> dict[str, dict[str, str]]:
+    """Services that start with the robot, control tasks among them, by name."""
+    # What `systemctl list-unit-files` would say, which takes an old processor twenty seconds.
+    wanted = glob.glob("/etc/systemd/system/*.wants/*.service")
+    names = sorted({os.path.basename(path) for path in wanted if os.path.exists(path)})
+    names = [name for name in names if "@." not in name] + [f"flotilla-task@{task}.service" for task in tasks]
+    running = output("systemctl", "list-units", "--plain", "--no-legend", "--all", "flotilla-*@*.service")
+    names += [line.split()[0] for line in running.splitlines() if line.split()[0] not in names]
+    blocks = output("systemctl", "show", "--property", UNIT_PROPERTIES, *names).strip().split("\n\n")
+    shown = (dict(line.split("=", 1) for line in block.splitlines()) for block in blocks)
+    return {unit["Id"]: unit for unit in shown if "Id" in unit}
+
+
+def is_up(unit: dict[str, str]) -> bool:
+    """Whether a service does what it is there for."""
+    if unit["ActiveState"] in ("active", "reloading"):
+        return True
+    done = unit["Type"] == "oneshot" and unit["RemainAfterExit"] == "no" and unit["Result"] == "success"
+    return unit["ActiveState"] == "inactive" and (unit["ConditionResult"] == "no" or done)
+
+
+def clock() -> dict[str, Any]:
+    """What chrony says: offset from its source in s, and whether it follows one."""
+    fields = output("chronyc", "-c", "tracking").strip().split(",")
+    if len(fields) < 14:
+        return {"synchronised": False, "offset_s": None}
+    return {"synchronised": fields[13] != "Not synchronised", "offset_s": float(fields[4])}
+
+
+def main() -> None:
+    arguments = json.loads(ARGUMENTS)
+    services = units(arguments["control_tasks"])
+    interface = json.loads(output("ip", "-json", "-4", "address", "show", "dev", arguments["interface"]) or "[]")
+    addresses = [f"{each['local']}/{each['prefixlen']}" for link in interface for each in link.get("addr_info", [])]
+    uarts = re.findall(r"^(\d+): uart:(?!unknown)", read("/proc/tty/driver/serial"), re.MULTILINE)
+    data = os.statvfs("/data")
+    wanted = {f"flotilla-task@{task}.service" for task in arguments["control_tasks"]}
+    tasks = {name for name in services if name.startswith("flotilla-task@")}
+    failed = output("systemctl", "list-units", "--state=failed", "--plain", "--no-legend")
+    state = {
+        "drift": drift(arguments["expected"], arguments["keep"]),
+        "hostname": socket.gethostname(),
+        "machine": os.uname().machine,
+        "uarts": [f"ttyS{number}" for number in uarts],
+        "addresses": addresses,
+        "firewall_is_loaded": firewall_is_loaded(),
+        "sysctl": sysctl_drift(),
+        "down": sorted(
+            name for name, unit in services.items() if not is_up(unit) and (name not in tasks or name in wanted)
+        ),
+        "superfluous_tasks": sorted(
+            name for name in tasks - wanted if services[name]["ActiveState"] not in ("inactive", "failed")
+        ),
+        "failed": [line.split()[0] for line in failed.splitlines()],
+        "tasks": {
+            name: {key: services[name][key] for key in ("ActiveState", "SubState", "NRestarts")} for name in tasks
+        },
+        "clock": clock(),
+        "data_free_bytes": data.f_bavail * data.f_frsize,
+        "boot_id": read("/proc/sys/kernel/random/boot_id").strip(),
+    }
+    print(json.dumps({"changed": False, "state": state}))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (OSError, ValueError, KeyError) as error:
+        print(json.dumps({"failed": True, "msg": f"{type(error).__name__}: {error}"}))

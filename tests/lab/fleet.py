@@ -1,0 +1,239 @@
+"""A virtual fleet: guests of the shipped images on one segment, left running in the background, to try a fleet on.
+
+`make fleet N=4` starts it, `make fleet-status` asks it, `make fleet-down` ends it. While it runs, `make ssh ROBOT=3`
+leads to the guest, and `build/fleet/guests.yml` tells Ansible where the guests are. What guests write is thrown away.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO
+
+import yaml
+
+from images.builder import boot, inventory, paths, progress, qemu
+from images.builder.build import image_of
+from images.builder.errors import UserError
+from images.builder.fleet import Fleet, Robot
+from tests.lab.guest import Guest
+from tests.lab.segment import Segment
+from tests.lab.ssh import Ssh
+from tests.lab.timing import LabError
+
+DIRECTORY = paths.BUILD / "fleet"
+GUESTS = DIRECTORY / "guests.yml"
+"""An inventory to put behind the real one: where the guests are. There while the fleet is."""
+_LOCK = DIRECTORY / "lock"
+"""Locked by the process that holds the fleet, whose number stands in it: without the lock, all here is left behind."""
+_LOG = DIRECTORY / "log"
+BOOT_SECONDS = 300
+DOWN_SECONDS = 30
+STATUS = """
+cut -d ' ' -f 1 /proc/uptime
+sudo systemctl is-system-running
+sudo systemctl list-units --plain --no-legend 'flotilla-task@*'
+"""
+"""What `make fleet-status` asks each robot."""
+
+
+def guests_inventory(ports: Mapping[str, int]) -> str:
+    """An Ansible inventory that says through which loopback ports the robots' guests are reached."""
+    hosts = {name: {"ansible_host": "127.0.0.1", "ansible_port": port} for name, port in ports.items()}
+    return yaml.safe_dump({"guests": {"hosts": hosts}})
+
+
+@contextmanager
+def running(fleet: Fleet, robots: Sequence[Robot], directory: Path) -> Iterator[tuple[dict[str, Guest], Segment]]:
+    """The robots as guests on one segment with the station, switched on, by name; not yet booted."""
+    station = fleet.stations[0].address if fleet.stations else qemu.station_address(
+        fleet.network, *(robot.address for robot in robots)
+    )  # fmt: skip
+    with ExitStack() as stack:
+        addresses = [robot.address for robot in robots]
+        segment = stack.enter_context(Segment(fleet.network, addresses, station, directory / "segment"))
+        guests = {}
+        for robot in robots:
+            options = qemu.Options(name=robot.name, mac=qemu.robot_mac(robot.number), link=segment.link(robot.address))
+            guest = Guest(fleet.boards[robot.board], image_of(robot), directory / robot.name, options)
+            guests[robot.name] = stack.enter_context(guest)
+            guest.on()
+        yield guests, segment
+
+
+def up(count: int) -> None:
+    """Start the first `count` robots as guests in the background, and wait until each lets us in."""
+    fleet = inventory.load_fleet()
+    robots = list(fleet.robots.values())[:count]
+    if not 1 <= count <= len(fleet.robots):
+        where = paths.shown(paths.INVENTORY / "robots.yml")
+        raise UserError(
+            f"N={count}: {where} has {len(fleet.robots)} robots; give 1 to {len(fleet.robots)}, or add some"
+        )
+    for robot in robots:
+        if not image_of(robot).exists():
+            raise UserError(f"{paths.shown(image_of(robot))} is missing; build it: make image ROBOT={robot.number}")
+    if ports := _ports():
+        if len(ports) != count:
+            raise UserError(f"a virtual fleet of {len(ports)} runs already; end it first: make fleet-down")
+        _say(ports, "runs already")
+        return
+    DIRECTORY.mkdir(parents=True, exist_ok=True)
+    argv = [sys.executable, "-m", "tests.lab.fleet", "hold", str(count)]
+    progress.command(argv)
+    with progress.step(f"boot {count} guests") as step, _LOG.open("w") as log:
+        holder = subprocess.Popen(
+            argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True, cwd=paths.PROJECT,
+            start_new_session=True,  # Ctrl-C here is not meant for it
+        )  # fmt: skip
+        try:
+            assert holder.stdout
+            for number, _ in enumerate(holder.stdout, 1):  # a line for each that has booted
+                step.at(number, count, "guests")
+            if holder.poll() is not None or not _ports():
+                raise UserError(f"the virtual fleet did not start; {paths.shown(_LOG)} says:\n{_LOG.read_text()}")
+        except BaseException:
+            holder.terminate()
+            raise
+    _say(_ports(), f"runs on {fleet.network.subnet}")
+
+
+def status() -> str:
+    """A line for each guest: uptime, state, tasks."""
+    ports = _ports()
+    if not ports:
+        return "no virtual fleet runs; start one: make fleet N=4"
+    robots = [robot for robot in inventory.load_fleet().robots.values() if robot.name in ports]
+
+    def ask(robot: Robot) -> str:
+        try:
+            done = subprocess.run(
+                [*boot.ssh_command(robot), STATUS], capture_output=True, text=True, timeout=60, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return f"{robot.name}  no answer"
+        if len(lines := done.stdout.splitlines()) < 2:
+            return f"{robot.name}  no answer: {done.stderr.strip()}"
+        uptime, state, *tasks = lines
+        shown = ", ".join(" ".join(task.split()[:4:3]) for task in tasks) or "no tasks"
+        return f"{robot.name}  port {ports[robot.name]}  up {uptime} s  {state}  {shown}"
+
+    with concurrent.futures.ThreadPoolExecutor(len(robots)) as pool:
+        return "\n".join(pool.map(ask, robots))
+
+
+def down() -> str:
+    """End the virtual fleet and remove what it left."""
+    ports = _ports()
+    if ports:
+        os.kill(int(_LOCK.read_text()), signal.SIGTERM)
+    deadline = time.monotonic() + DOWN_SECONDS
+    while (lock := _free_lock()) is None:
+        if time.monotonic() > deadline:
+            raise UserError(
+                f"the virtual fleet did not end within {DOWN_SECONDS} s; process {_LOCK.read_text()} holds it"
+            )
+        time.sleep(0.05)  # the lock tells nobody when it becomes free within a bound
+    with lock:
+        GUESTS.unlink(missing_ok=True)
+    return f"{len(ports)} guests ended" if ports else "no virtual fleet runs"
+
+
+def hold(count: int) -> None:
+    """Be the process in the background: a line on standard output for each robot that has booted."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    lock = _free_lock()
+    if lock is None:
+        raise UserError("a virtual fleet runs already; end it: make fleet-down")
+    fleet = inventory.load_fleet()
+    robots = list(fleet.robots.values())[:count]
+    with lock, ExitStack() as stack:
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        guests, segment = stack.enter_context(running(fleet, robots, DIRECTORY))
+        ports = {robot.name: segment.ssh_port(robot.address) for robot in robots}
+        for robot in robots:
+            guests[robot.name].console.expect(rf"{robot.name} login: ", BOOT_SECONDS)
+            with Ssh(robot, "127.0.0.1", lambda name=robot.name: ports[name]) as shell:  # type: ignore[misc]
+                shell.connect()
+            stack.enter_context(boot.announced(robot, ports[robot.name]))
+            print(robot.name, flush=True)
+        beside = GUESTS.with_suffix(".new")
+        beside.write_text(guests_inventory(ports))
+        beside.rename(GUESTS)
+        sys.stdout.close()
+        os.close(1)
+        signal.sigwait({signal.SIGTERM})
+        GUESTS.unlink()
+
+
+def _ports() -> dict[str, int]:
+    """SSH ports of the running fleet's guests by robot; empty when none runs."""
+    lock = _free_lock()
+    if lock is not None:
+        lock.close()
+        return {}
+    if not GUESTS.exists():
+        raise UserError("a virtual fleet is starting or ending; try again, or end it: make fleet-down")
+    hosts = yaml.safe_load(GUESTS.read_text())["guests"]["hosts"]
+    return {name: values["ansible_port"] for name, values in hosts.items()}
+
+
+def _free_lock() -> IO[str] | None:
+    """The lock, held until it is closed; None when a fleet runs."""
+    DIRECTORY.mkdir(parents=True, exist_ok=True)
+    lock = _LOCK.open("a+")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        return None
+    return lock
+
+
+def _say(ports: Mapping[str, int], how: str) -> None:
+    listed = ", ".join(f"{name} on port {port}" for name, port in ports.items())
+    guests = os.path.relpath(GUESTS, paths.PROJECT / "ansible")
+    sys.stderr.write(
+        f"virtual fleet {how}: {listed}\n"
+        f"provision it: cd ansible && ansible-playbook -i inventory -i {guests} -l guests fleet.yml\n"
+        "shell: make ssh ROBOT=1    state: make fleet-status    end: make fleet-down\n"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.lab.fleet", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name in ("up", "hold"):
+        commands.add_parser(name).add_argument("count", type=int, help="of guests")
+    for name in ("status", "down"):
+        commands.add_parser(name)
+    arguments = parser.parse_args()
+    try:
+        match arguments.command:
+            case "up":
+                up(arguments.count)
+            case "hold":
+                hold(arguments.count)
+            case "status":
+                print(status())
+            case "down":
+                print(down())
+    except (UserError, LabError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
