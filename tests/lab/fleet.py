@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import fcntl
+import functools
 import os
 import signal
 import subprocess
@@ -164,7 +165,7 @@ def hold(count: int) -> None:
         ports = {robot.name: segment.ssh_port(robot.address) for robot in robots}
         for robot in robots:
             guests[robot.name].console.expect(rf"{robot.name} login: ", BOOT_SECONDS)
-            with Ssh(robot, "127.0.0.1", lambda name=robot.name: ports[name]) as shell:  # type: ignore[misc]
+            with Ssh(robot, "127.0.0.1", functools.partial(ports.__getitem__, robot.name)) as shell:
                 shell.connect()
             stack.enter_context(boot.announced(robot, ports[robot.name]))
             print(robot.name, flush=True)

@@ -56,6 +56,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
                 "name": robot.name,
                 "interface": arguments["interface"],
                 "addresses": [f"{robot.address}/{fleet.network.subnet.prefixlen}"],
+                "subnet": str(fleet.network.subnet),
                 "machine": MACHINES[fleet.boards[robot.board].architecture],
                 "uarts": sorted(
                     port.tty for port in fleet.boards[robot.board].ports.values() if port.tty.startswith("ttyS")
