@@ -31,7 +31,7 @@ pytestmark = pytest.mark.boot
 ANSIBLE = paths.PROJECT / "ansible"
 BOOT_SECONDS = 600
 RUN_SECONDS = 600
-REPORT = paths.BUILD / "reports" / "fleet.json"
+REPORTS = paths.BUILD / "reports"
 
 Report = dict[str, Any]
 
@@ -68,20 +68,24 @@ class Guests:
         file.write_text(virtual.guests_inventory(ports))
         return file
 
-    def argv(self, *more: str, inventory: Path = paths.INVENTORY, ports: Mapping[str, int] | None = None) -> list[str]:
+    def argv(
+        self, *more: str, playbook: str = "fleet", inventory: Path = paths.INVENTORY,
+        ports: Mapping[str, int] | None = None,
+    ) -> list[str]:  # fmt: skip
         program = Path(sys.executable).with_name("ansible-playbook")
         there = self.inventory(ports or self.ports)
-        return [str(program), "-i", str(inventory), "-i", str(there), "-l", "guests", "fleet.yml", *more]
+        return [str(program), "-i", str(inventory), "-i", str(there), "-l", "guests", f"{playbook}.yml", *more]
 
-    def play(self, *more: str, inventory: Path = paths.INVENTORY, ports: Mapping[str, int] | None = None) -> Playbook:
-        REPORT.unlink(missing_ok=True)
+    def play(self, *more: str, playbook: str = "fleet", **where: Any) -> Playbook:
+        report = REPORTS / f"{playbook}.json"
+        report.unlink(missing_ok=True)
         done = subprocess.run(
-            self.argv(*more, inventory=inventory, ports=ports), cwd=ANSIBLE, env=ENVIRONMENT, stdin=subprocess.DEVNULL,
+            self.argv(*more, playbook=playbook, **where), cwd=ANSIBLE, env=ENVIRONMENT, stdin=subprocess.DEVNULL,
             capture_output=True, text=True, timeout=RUN_SECONDS, check=False,
         )  # fmt: skip
         said = done.stdout + done.stderr
         (self.directory / "ansible.log").write_text(said)
-        return Playbook(done.returncode, said, json.loads(REPORT.read_text()) if REPORT.exists() else {"robots": {}})
+        return Playbook(done.returncode, said, json.loads(report.read_text()) if report.exists() else {"robots": {}})
 
     def sudo(self, name: str, script: str) -> str:
         return self.shells[name].run(["sudo", "sh", "-ec", script]).stdout
@@ -123,7 +127,7 @@ DRIFT = {
 """What goes astray on each robot, as a script, and how the report names it."""
 MORE_DRIFT = {
     "robot2": ("systemctl stop flotilla-zram", "flotilla-zram.service does not run"),
-    "robot3": ("rm -r /etc/systemd/system/multi-user.target.wants", "chrony.service was removed"),
+    "robot3": ("rm -r /etc/systemd/system/multi-user.target.wants", "multi-user.target.wants was removed"),
     "robot4": ("echo ssh-ed25519 AAAA stranger >>/etc/ssh/authorized_keys/robot", "authorized_keys/robot has another"),
 }  # fmt: skip
 
@@ -134,7 +138,7 @@ def test_robots_that_were_just_flashed_are_up_to_date(guests: Guests) -> None:
     assert done.status == 0, done.said
     assert done.outcomes() == dict.fromkeys(guests.robots, "up to date"), done.report
     assert done.report["check"] is False
-    page = REPORT.with_suffix(".html").read_text()
+    page = (REPORTS / "fleet.html").read_text()
     assert all(name in page for name in guests.robots)
 
 
@@ -171,7 +175,7 @@ def test_a_robot_that_dies_stops_the_roll_out_and_nothing_is_half_done(guests: G
             if line.startswith("changed: [robot2]"):
                 guests.machines["robot2"].cut()
     assert run.returncode != 0
-    report = json.loads(REPORT.read_text())
+    report = json.loads((REPORTS / "fleet.json").read_text())
     assert {name: robot["outcome"] for name, robot in report["robots"].items()} == {
         "robot1": "changed",
         "robot2": "unreachable",
@@ -243,6 +247,40 @@ def test_the_inventory_is_checked_before_anything_is_done(guests: Guests, tmp_pa
     done = guests.play("-l", "robot4", inventory=inventory)
     assert done.outcomes() == {"robot4": "failed"}
     assert "is robot3's number" in done.report["robots"]["robot4"]["messages"][0]
+
+
+def test_a_task_is_stopped_and_started(guests: Guests) -> None:
+    def state(done: Playbook) -> str:
+        assert done.status == 0, done.said
+        found: str = done.report["robots"]["robot1"]["state"]["tasks"]["flotilla-task@heading.service"]["ActiveState"]
+        return found
+
+    for do, after in (("stop", "inactive"), ("status", "inactive"), ("start", "active")):
+        done = guests.play("-l", "robot1,robot4", "-e", f"do={do}", "-e", "task=heading", playbook="tasks")
+        assert state(done) == after
+    refused = guests.play("-l", "robot1", "-e", "do=halt", playbook="tasks")
+    assert "do=halt: one of status, deploy" in refused.said
+
+
+def test_what_robots_say_and_record_is_collected(guests: Guests) -> None:
+    guests.sudo("robot1", "echo 1,2,3 >/var/lib/flotilla/heading/some.csv; chown -R robot /var/lib/flotilla/heading")
+    done = guests.play("-l", "robot1", playbook="collect")
+    assert done.status == 0, done.said
+    place = paths.BUILD / "collected" / "robot1"
+    assert "flotilla-task@heading" in (place / "journal.txt").read_text()
+    assert "Linux version" in (place / "dmesg.txt").read_text()
+    assert json.loads((place / "state.json").read_text())["hostname"] == "robot1"
+    assert (place / "heading" / "some.csv").read_text() == "1,2,3\n"
+    guests.sudo("robot1", "rm /var/lib/flotilla/heading/some.csv")
+
+
+def test_robots_restart_and_are_healthy(guests: Guests) -> None:
+    before = guests.sudo("robot4", "cat /proc/sys/kernel/random/boot_id")
+    done = guests.play("-l", "robot4", playbook="reboot")
+    assert done.status == 0, done.said
+    guests.shells["robot4"].close()
+    guests.shells["robot4"].connect()
+    assert guests.sudo("robot4", "cat /proc/sys/kernel/random/boot_id") != before
 
 
 def altered(directory: Path, file: str, old: str, new: str) -> Path:
