@@ -47,7 +47,8 @@ fleet-down: | setup-tests ## end the virtual fleet
 	$(Q)$(PYTHON) -m tests.lab.fleet down
 
 provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [PLAYBOOK=fleet ARGS=--check]
-	$(Q)cd ansible && PATH="$(abspath $(VENV))/bin:$$PATH" ansible-playbook -i inventory \
+	$(Q)cd ansible && export PATH="$(abspath $(VENV))/bin:$$PATH" BUILD="$(abspath $(BUILD))" && \
+	    $(if $(KEYS),KEYS="$(abspath $(KEYS))") ansible-playbook -i inventory \
 	    $(if $(filter guests,$(ON)),-i $(abspath $(BUILD))/fleet/guests.yml -l $(if $(ROBOT),robot$(ROBOT),guests), \
 	        $(if $(ROBOT),-l robot$(ROBOT))) $(ARGS) $(or $(PLAYBOOK),fleet).yml
 

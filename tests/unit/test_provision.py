@@ -1,0 +1,51 @@
+"""The builder's half of provisioning: which files a robot has, and which role looks after each."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from images.builder import paths, provision
+from images.builder.errors import UserError
+from images.builder.identity import render
+
+ROLES = paths.PROJECT / "ansible" / "roles"
+
+
+def test_files_are_those_of_the_card_image() -> None:
+    fleet, robot = provision.robot(paths.INVENTORY, "robot1")
+    files = provision.files(paths.INVENTORY, "robot1")
+    assert files == {str(path): file for path, file in render(fleet, robot).items()}
+    assert files["/etc/hostname"] == (b"robot1\n", 0o644)
+
+
+@pytest.mark.parametrize(
+    ("path", "role"),
+    [
+        ("/etc/hostname", "identity"),
+        ("/etc/systemd/network/10-fleet.network", "network"),
+        ("/etc/systemd/system/chrony.service.d/more.conf", "runtime"),
+        ("/etc/systemd/system/sysinit.target.d/tasks.conf", "control_tasks"),
+        ("/etc/hosts.allow", "identity"),
+    ],
+)
+def test_the_longest_path_decides_which_role_mends_a_file(path: str, role: str) -> None:
+    """Seen to fail with the table in its own order."""
+    assert provision.role_of(path) == role
+
+
+def test_what_no_role_looks_after_is_an_error() -> None:
+    with pytest.raises(UserError, match=r"/usr/bin/sh: no role.*ansible/files.yml"):
+        provision.role_of("/usr/bin/sh")
+
+
+def test_every_role_is_there_and_played() -> None:
+    named = set(yaml.safe_load(provision.ROLES.read_text()))
+    (play,) = yaml.safe_load((paths.PROJECT / "ansible" / "fleet.yml").read_text())
+    assert named == set(play["roles"]) == {path.name for path in ROLES.iterdir()}
+    assert all((ROLES / name / "meta" / "argument_specs.yml").exists() for name in named)
+
+
+def test_a_stranger_is_an_error() -> None:
+    with pytest.raises(UserError, match="robot9 is not a robot of ansible/inventory"):
+        provision.robot(paths.INVENTORY, "robot9")
