@@ -80,7 +80,7 @@ test: | setup-tests ## everything: checks, images, boots in QEMU
 	$(Q)$(MAKE) check
 	$(Q)$(FLOTILLA) image --all
 	$(Q)$(FLOTILLA) kernel --board smartcoret3
-	$(Q)$(VENV)/bin/pytest tests
+	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit
 
 bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
