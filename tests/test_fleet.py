@@ -76,12 +76,14 @@ class Guests:
         there = self.inventory(ports or self.ports)
         return [str(program), "-i", str(inventory), "-i", str(there), "-l", "guests", f"{playbook}.yml", *more]
 
-    def play(self, *more: str, playbook: str = "fleet", **where: Any) -> Playbook:
+    def play(
+        self, *more: str, playbook: str = "fleet", environment: Mapping[str, str] | None = None, **where: Any
+    ) -> Playbook:
         report = REPORTS / f"{playbook}.json"
         report.unlink(missing_ok=True)
         done = subprocess.run(
-            self.argv(*more, playbook=playbook, **where), cwd=ANSIBLE, env=ENVIRONMENT, stdin=subprocess.DEVNULL,
-            capture_output=True, text=True, timeout=RUN_SECONDS, check=False,
+            self.argv(*more, playbook=playbook, **where), cwd=ANSIBLE, env=environment or ENVIRONMENT,
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=RUN_SECONDS, check=False,
         )  # fmt: skip
         said = done.stdout + done.stderr
         (self.directory / "ansible.log").write_text(said)
@@ -281,6 +283,26 @@ def test_robots_restart_and_are_healthy(guests: Guests) -> None:
     guests.shells["robot4"].close()
     guests.shells["robot4"].connect()
     assert guests.sudo("robot4", "cat /proc/sys/kernel/random/boot_id") != before
+
+
+def test_a_new_card_can_get_a_new_host_key_everywhere(guests: Guests, tmp_path: Path) -> None:
+    """With keys of its own, so the last test of these guests. Seen to fail without the retired key in known_hosts."""
+    keys = tmp_path / "keys"
+    shutil.copytree(paths.KEYS, keys)
+    old = (keys / "robot4_ed25519.pub").read_text().split()[1]
+    more = ("-l", "guests,localhost", "-e", json.dumps({"replaced": "robot4", "rotate": True}), *AT_ONCE)
+    done = guests.play(*more, playbook="replace", environment=ENVIRONMENT | {"KEYS": str(keys)})
+    assert done.status == 0, done.said
+    new = (keys / "robot4_ed25519.pub").read_text().split()[1]
+    assert new != old
+    assert old not in (keys / "known_hosts").read_text()
+    for name in ("robot1", "robot2", "robot3"):
+        known = guests.sudo(name, "cat /etc/ssh/ssh_known_hosts")
+        assert new in known
+        assert old not in known
+    again = guests.play("-l", "robot4", environment=ENVIRONMENT | {"KEYS": str(keys)})
+    assert again.outcomes() == {"robot4": "up to date"}
+    assert guests.play("-l", "robot4").outcomes() == {"robot4": "unreachable"}, "the old key is still good"
 
 
 def altered(directory: Path, file: str, old: str, new: str) -> Path:

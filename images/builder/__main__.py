@@ -78,6 +78,15 @@ def _kernel(arguments: argparse.Namespace) -> None:
     print(kernel.report([arguments.board]))
 
 
+def _rotate_key(arguments: argparse.Namespace) -> None:
+    from images.builder import identity, inventory
+
+    fleet = inventory.load_fleet()
+    (identity.retire_host_key if arguments.retire else identity.rotate_host_key)(
+        fleet, inventory.robot(fleet, arguments.robot)
+    )
+
+
 def _lock(_: argparse.Namespace) -> None:
     from images.builder import lock
 
@@ -100,6 +109,7 @@ _COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
     "hwcheck": (_hwcheck, "what a robot's hardware is and does"),
     "bench": (_bench, "wall times and ratios against other builders"),
     "kernel": (_kernel, "build a kernel of our own as a Debian package"),
+    "rotate-key": (_rotate_key, "give a robot a new host key"),
     "lock": (_lock, "resolve the package lists"),
     "check-fleet": (_check_fleet, "validate the inventory"),
 }
@@ -109,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m images.builder", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
-    for name in ("image", "flash", "boot", "ssh", "size", "verify", "hwcheck", "bench"):
+    for name in ("image", "flash", "boot", "ssh", "size", "verify", "hwcheck", "bench", "rotate-key"):
         made[name].add_argument("--robot", type=int, help="number in the inventory")
     made["kernel"].add_argument("--board", required=True, help="name in kernel/kernels.yml")
     made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
@@ -117,6 +127,7 @@ def _parser() -> argparse.ArgumentParser:
         "--seconds", type=int, default=60, help="of looking for hardware latency (%(default)s)"
     )
     made["verify"].add_argument("--plant", action="store_true", help="plant a difference, which must be found")
+    made["rotate-key"].add_argument("--retire", action="store_true", help="accept the old one no more")
     target = made["flash"].add_mutually_exclusive_group(required=True)
     target.add_argument("--device", type=Path, help="the card: /dev/sdX")
     target.add_argument("--file", type=Path, help="a file instead of a card")

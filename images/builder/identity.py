@@ -52,13 +52,35 @@ def host_keys(fleet: Fleet) -> dict[str, str]:
     """Public host key of every robot by name; makes what is missing, and the `known_hosts` that pins them."""
     robots = sorted(fleet.robots.values(), key=lambda robot: robot.number)
     keys = {robot.name: _public(_key(f"{robot.name}_ed25519", robot.name)) for robot in robots}
-    pinned = "".join(f"{robot.name},{robot.address} {keys[robot.name]}\n" for robot in robots)
+    accepted = [(robot, keys[robot.name]) for robot in robots]
+    accepted += [(robot, _retired(robot).read_text().strip()) for robot in robots if _retired(robot).exists()]
+    pinned = "".join(f"{robot.name},{robot.address} {key}\n" for robot, key in accepted)
     known = paths.KEYS / "known_hosts"
     if not known.exists() or known.read_text() != pinned:
         beside = known.with_name(f".known_hosts.{os.getpid()}")
         beside.write_text(pinned)
         beside.rename(known)
     return keys
+
+
+def _retired(robot: Robot) -> Path:
+    """The public host key that a robot may still have, while its new one is on the way."""
+    return paths.KEYS / f"{robot.name}_ed25519.retired"
+
+
+def rotate_host_key(fleet: Fleet, robot: Robot) -> None:
+    """Give a robot a new host key. The old one is accepted on this computer until `retire_host_key`."""
+    private = paths.KEYS / f"{robot.name}_ed25519"
+    _retired(robot).write_text(host_keys(fleet)[robot.name] + "\n")
+    for file in (private, private.with_name(private.name + ".pub")):
+        file.unlink()
+    host_keys(fleet)
+
+
+def retire_host_key(fleet: Fleet, robot: Robot) -> None:
+    """Accept the old host key of a robot no more."""
+    _retired(robot).unlink(missing_ok=True)
+    host_keys(fleet)
 
 
 def hosts(fleet: Fleet) -> list[Host]:

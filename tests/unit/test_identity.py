@@ -130,3 +130,16 @@ def test_a_mistake_in_a_template_names_the_file(fleet: Fleet, tmp_path: Path, mo
 
 def test_the_fleet_model_survives_a_round_trip(fleet: Fleet) -> None:
     assert Fleet.model_validate(json.loads(fleet.model_dump_json())) == fleet
+
+
+def test_a_rotated_host_key_is_accepted_beside_the_old_one_until_that_is_retired(fleet: Fleet) -> None:
+    robot = fleet.robots[3]
+    old = identity.host_keys(fleet)["robot3"]
+    identity.rotate_host_key(fleet, robot)
+    new = identity.host_keys(fleet)["robot3"]
+    known = paths.KEYS / "known_hosts"
+    assert new != old
+    assert {f"robot3,10.42.0.3 {key}" for key in (old, new)} <= set(known.read_text().splitlines())
+    identity.retire_host_key(fleet, robot)
+    assert old not in known.read_text()
+    assert new in known.read_text()
