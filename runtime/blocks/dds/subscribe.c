@@ -1,7 +1,7 @@
 #define _GNU_SOURCE
 #include "topic.h"
 
-#include <math.h>
+#include <flotilla/sensor.h>
 #include <stdatomic.h>
 #include <string.h>
 
@@ -20,17 +20,15 @@ struct state {
     struct dds_sample arriving, taken; /* DDS's thread's, the step's */
     _Atomic uint32_t peers;
     _Atomic bool late; /* the deadline passed since the last sample */
-    int64_t arrived_ns;
-    uint32_t sequence;
+    struct fl_sensor sensor;
 };
 
 static const struct fl_parameter parameters[] = {
     DDS_PARAMETERS(struct dds_settings),
-    FL_PARAMETER(struct dds_subscribe, timeout, .fallback = "0.1", .min = 1e-6, .max = 1e6, .unit = "s",
-                 .summary = "age at which a sample is no longer good"),
+    FL_SENSOR_TIMEOUT(struct dds_subscribe, "0.1"),
 };
 
-enum { VALUES, NUMBER, STAMP, PEERS, FLAG, AGE, SEQUENCE };
+enum { VALUES, NUMBER, STAMP, PEERS, FLAG };
 
 static void matched(dds_entity_t reader, const dds_subscription_matched_status_t status, void *context)
 {
@@ -132,7 +130,7 @@ static int start(struct fl_block *block)
         return FL_FAILED;
     state->settings = ((const struct dds_subscribe *)block->parameters)->common;
     state->block = block;
-    state->arrived_ns = fl_now_ns();
+    fl_sensor_begin(&state->sensor);
     fl_ring_initialize(&state->samples, memory, sizeof(struct dds_sample), WAITING);
     state->driver = fl_driver_start(block, run, state);
     return state->driver ? FL_OK : FL_FAILED;
@@ -146,15 +144,10 @@ static int step(struct fl_block *block)
         memcpy(block->out[VALUES], state->taken.values, dds_value_bytes(&state->settings));
         FL_OUT(block, NUMBER, uint32_t) = state->taken.number;
         FL_OUT(block, STAMP, int64_t) = state->taken.stamp_ns;
-        state->arrived_ns = state->taken.arrived_ns;
-        state->sequence++;
+        fl_sensor_update(&state->sensor, state->taken.arrived_ns, state->sensor.sequence + 1);
     }
-    int64_t age_ns = block->release_ns > state->arrived_ns ? block->release_ns - state->arrived_ns : 0;
     FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
-    FL_OUT(block, FLAG, uint8_t) =
-        state->sequence && !atomic_load(&state->late) && age_ns <= llround(set->timeout * 1e9);
-    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
-    FL_OUT(block, SEQUENCE, uint32_t) = state->sequence;
+    fl_sensor_outputs(&state->sensor, block, FLAG, !atomic_load(&state->late), set->timeout);
     return FL_OK;
 }
 

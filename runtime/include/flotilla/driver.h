@@ -28,14 +28,6 @@ int fl_driver_stop_fd(const struct fl_driver *driver);
  * 1 ready, 0 time-out, -1 the thread shall return, -2 the device is gone (hang-up or error). */
 int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int timeout_ms);
 
-/* --- sensors --- */
-
-/* The last outputs of every sensor block, after its values. */
-#define FL_SENSOR_OUTPUTS                                                                                              \
-    {.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: the value is good and not older than `timeout`"},  \
-        {.name = "age", .type = FL_DOUBLE, .width = 1, .unit = "s", .summary = "time since the value arrived"},        \
-        {.name = "sequence", .type = FL_UINT32, .width = 1, .summary = "values received so far"}
-
 /* --- serial port --- */
 
 /* Members and parameters of a block with a serial port, as the port's mask lists them. */
