@@ -5,7 +5,7 @@
 #include <stdatomic.h>
 #include <string.h>
 
-enum { WAITING = 16, RETRY_MS = 1000, BATCH = 8 };
+enum { WAITING = 16, BATCH = 8 };
 
 struct dds_subscribe {
     struct dds_settings common;
@@ -67,44 +67,26 @@ static void arrived(dds_entity_t reader, void *context)
     }
 }
 
-/* Until the thread shall return: true; or false when DDS cannot be had now. */
-static bool subscribe(struct state *state, struct fl_driver *driver, dds_entity_t participant)
+static void set_listener(dds_listener_t *listener)
 {
-    dds_listener_t *listener = dds_create_listener(state);
-    dds_qos_t *qualities = dds_qualities(&state->settings);
     dds_lset_data_available(listener, arrived);
     dds_lset_subscription_matched(listener, matched);
     dds_lset_requested_deadline_missed(listener, missed);
-    dds_entity_t topic = dds_open_topic(&state->settings, participant);
-    dds_entity_t reader = topic < 0 ? topic : dds_create_reader(participant, topic, qualities, listener);
-    dds_delete_qos(qualities);
-    dds_delete_listener(listener);
-    if (reader < 0)
-        fl_log(state->block, "topic %s: %s", state->settings.topic, dds_strretcode(reader));
-    else
-        fl_driver_wait(driver, -1, false, -1);
-    if (reader >= 0)
-        dds_delete(reader); /* waits for a listener that is being called */
-    if (topic >= 0)
-        dds_delete(topic);
-    return reader >= 0;
+}
+
+/* DDS's own thread calls the listener. */
+static void serve(void *context, struct fl_driver *driver, dds_entity_t reader)
+{
+    (void)context;
+    (void)reader;
+    fl_driver_wait(driver, -1, false, -1);
 }
 
 static void run(struct fl_driver *driver, void *context)
 {
+    static const struct dds_endpoint endpoint = {dds_create_reader, set_listener, serve};
     struct state *state = context;
-    uint32_t domain = (uint32_t)state->settings.domain;
-    do {
-        dds_entity_t participant = dds_participant(domain);
-        if (participant < 0) {
-            fl_log(state->block, "DDS domain %u: %s", (unsigned)domain, dds_strretcode(participant));
-            continue;
-        }
-        bool done = subscribe(state, driver, participant);
-        dds_release_participant(domain);
-        if (done)
-            return;
-    } while (fl_driver_wait(driver, -1, false, RETRY_MS) == 0);
+    dds_run(&endpoint, &state->settings, state->block, driver, state);
 }
 
 static int configure(struct fl_block *block)

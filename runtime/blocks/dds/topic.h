@@ -57,12 +57,16 @@ void dds_encode(const struct dds_settings *settings, const struct dds_sample *sa
 /* False: of another length. */
 bool dds_decode(const struct dds_settings *settings, const void *storage, struct dds_sample *sample);
 
-/* The participant of a domain, made by the first that asks; negative: a DDS error. Each success is to be released. */
-dds_entity_t dds_participant(uint32_t domain);
-void dds_release_participant(uint32_t domain);
+/* A writer or reader of a topic. */
+struct dds_endpoint {
+    dds_entity_t (*create)(dds_entity_t participant, dds_entity_t topic, const dds_qos_t *qualities,
+                           const dds_listener_t *listener);
+    void (*set_listener)(dds_listener_t *listener); /* say what is to be called, with the context given to dds_run */
+    void (*serve)(void *context, struct fl_driver *driver, dds_entity_t entity); /* until the thread shall return */
+};
 
-/* Topic and qualities for a writer or reader; the caller deletes both. Negative: a DDS error. */
-dds_entity_t dds_open_topic(const struct dds_settings *settings, dds_entity_t participant);
-dds_qos_t *dds_qualities(const struct dds_settings *settings);
+/* What a block's thread does: have the endpoint, and serve it; try again while DDS cannot be had. */
+void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, struct fl_block *block,
+             struct fl_driver *driver, void *context);
 
 #endif
