@@ -76,11 +76,12 @@ runtime: | setup-tests ## the runtime's programs for this computer, in build/run
 	$(Q)test -f $(BUILD)/runtime/build.ninja || $(meson) setup $(BUILD)/runtime runtime >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime)
 
-check-runtime: | setup-tests ## the runtime's unit tests, with AddressSanitizer and UBSan
+check-runtime: | setup-tests ## the runtime's format, clang-tidy, and unit tests with AddressSanitizer and UBSan
 	$(Q)git ls-files 'runtime/*.[ch]' | xargs $(VENV)/bin/clang-format --dry-run -Werror
 	$(Q)test -f $(BUILD)/runtime-sanitized/build.ninja || $(meson) setup $(BUILD)/runtime-sanitized runtime -Dtests=true \
 	    -Db_sanitize=address,undefined -Dbuildtype=debugoptimized >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime-sanitized)
+	$(Q)$(PYTHON) -m tests.tidy $(BUILD)/runtime-sanitized
 	$(Q)$(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
 fuzz: | setup-tests ## fuzz the runtime's parsers: make fuzz [SECONDS=60], of each; what is found goes to build/found

@@ -40,7 +40,8 @@ int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int ti
 
 #define FL_SERIAL_PARAMETERS(type, usual_baud)                                                                         \
     FL_PARAMETER(type, device, .summary = "serial port: /dev/robot/NAME"),                                             \
-        FL_PARAMETER(type, baud, .fallback = usual_baud, .min = 300, .max = 4000000, .unit = "Bd", .summary = "rate"), \
+        FL_PARAMETER(type, baud, .fallback = (usual_baud), .min = 300, .max = 4000000, .unit = "Bd",                   \
+                     .summary = "rate"),                                                                               \
         FL_PARAMETER(type, data_bits, .fallback = "8", .min = 5, .max = 8, .summary = "bits of a character"),          \
         FL_PARAMETER(type, stop_bits, .fallback = "1", .min = 1, .max = 2, .summary = "stop bits"),                    \
         FL_PARAMETER(type, parity, .fallback = "none", .choices = "none|odd|even", .summary = "parity bit")
