@@ -20,12 +20,13 @@ struct dds_sample {
     _Alignas(8) uint8_t values[DDS_VALUES];
 };
 
-#define DDS_MEMBERS                                                                                                    \
-    int type;                                                                                                          \
-    const char *topic;                                                                                                 \
-    int64_t domain, bytes, robot;                                                                                      \
-    int reliability;                                                                                                   \
-    double deadline
+struct dds_settings {
+    int type;
+    const char *topic;
+    int64_t domain, bytes, robot;
+    int reliability;
+    double deadline;
+};
 
 #define DDS_PARAMETERS(block_type)                                                                                     \
     FL_PARAMETER(block_type, type, .choices = "state|wrench|valves|bytes",                                             \
@@ -40,10 +41,6 @@ struct dds_sample {
                      .summary = "whether lost samples are sent again, as long as they are the newest"),                \
         FL_PARAMETER(block_type, deadline, .fallback = "0", .min = 0, .max = 1e6, .unit = "s",                         \
                      .summary = "longest time between samples that is promised, or asked for; 0: none")
-
-struct dds_settings {
-    DDS_MEMBERS;
-};
 
 /* The port that carries the type's values. */
 struct fl_port dds_port(const struct dds_settings *settings);

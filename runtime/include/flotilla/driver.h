@@ -21,9 +21,6 @@ struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_
 /* Ask the thread to return and wait for it. NULL is allowed. */
 void fl_driver_stop(struct fl_driver *driver);
 
-/* A descriptor that becomes readable when the thread shall return: poll it beside the device's. */
-int fl_driver_stop_fd(const struct fl_driver *driver);
-
 /* Wait until `fd` is readable (or writable with `writable`), at most `timeout_ms` (-1: for ever; fd -1: only wait).
  * 1 ready, 0 time-out, -1 the thread shall return, -2 the device is gone (hang-up or error). */
 int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int timeout_ms);

@@ -67,15 +67,9 @@ static void refuses_each_flipped_bit(void **state)
     }
 }
 
-/* Text with its checksum. */
 static const char *record_of(const char *text)
 {
-    static char record[256];
-    unsigned sum = 0;
-    for (const char *at = text; *at; at++)
-        sum ^= (unsigned char)*at;
-    snprintf(record, sizeof record, "$%s%%%02X\r\n", text, sum);
-    return record;
+    return line_record(text, '%');
 }
 
 static void refuses_other_records(void **state)
