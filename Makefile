@@ -76,8 +76,9 @@ check: | setup-tests ## lint, types and unit tests, under a minute
 	$(Q)$(MAKE) check-runtime
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 
-test: | setup-tests ## everything: checks, images, boots in QEMU
+test: | setup-tests ## everything: checks, a short fuzzing, images, boots in QEMU
 	$(Q)$(MAKE) check
+	$(Q)$(MAKE) fuzz SECONDS=3
 	$(Q)$(FLOTILLA) image --all
 	$(Q)$(FLOTILLA) kernel --board smartcoret3
 	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit
@@ -94,23 +95,25 @@ runtime: | setup-tests ## the runtime's programs for this computer, in build/run
 	$(Q)test -f $(BUILD)/runtime/build.ninja || $(meson) setup $(BUILD)/runtime runtime >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime)
 
-check-runtime: | setup-tests ## the runtime's unit tests, with AddressSanitizer and UBSan
+check-runtime: | setup-tests ## the runtime's format, clang-tidy, and unit tests with AddressSanitizer and UBSan
 	$(Q)git ls-files 'runtime/*.[ch]' | xargs $(VENV)/bin/clang-format --dry-run -Werror
 	$(Q)test -f $(BUILD)/runtime-sanitized/build.ninja || $(meson) setup $(BUILD)/runtime-sanitized runtime -Dtests=true \
 	    -Db_sanitize=address,undefined -Dbuildtype=debugoptimized >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime-sanitized)
+	$(Q)$(PYTHON) -m tests.tidy $(BUILD)/runtime-sanitized
 	$(Q)$(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
-fuzz: | setup-tests ## fuzz the runtime's parsers: make fuzz [SECONDS=60], of each; what is found goes to build/found
+fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60]; finds go to build/found
 	$(Q)images/install-host-packages tests/fuzz-packages.txt
 	$(Q)test -f $(BUILD)/fuzz/build.ninja || CC=clang $(meson) setup $(BUILD)/fuzz runtime -Dtests=true -Dfuzz=true \
 	    -Dbuildtype=debugoptimized >/dev/null
 	$(Q)$(call compile,$(BUILD)/fuzz,fuzzers)
-	$(Q)set -e; for fuzzer in $$(find $(BUILD)/fuzz/tests/fuzz -maxdepth 1 -type f -name 'fuzz_*' | sort); do \
-	    name=$${fuzzer##*/fuzz_}; found=$(BUILD)/found/$$name; known=runtime/tests/fuzz/corpus/$$name; \
+	$(Q)$(meson) test -C $(BUILD)/fuzz --suite fuzz --no-rebuild --print-errorlogs --quiet
+	$(Q)set -e; for known in runtime/tests/fuzz/corpus/*; do \
+	    name=$${known##*/}; found=$(BUILD)/found/$$name; \
 	    mkdir -p $$found; echo "$$name: $(or $(SECONDS),60) s"; \
-	    $$fuzzer -max_total_time=$(or $(SECONDS),60) -max_len=1024 -verbosity=0 -artifact_prefix=$$found- $$found \
-	        $$(test ! -d $$known || echo $$known) 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
+	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(or $(SECONDS),60) -max_len=1024 -timeout=10 -verbosity=0 \
+	        -artifact_prefix=$$found- $$found $$known 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
 bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=5]
 	$(Q)images/install-host-packages runtime/bench/packages.txt

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
 import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +14,9 @@ import pytest
 from images.builder import paths
 from tests.emulators.can_bus import UdpHub
 from tests.emulators.epos2 import Axis, Epos2, Epos2Server
+from tests.running import PATIENCE, running
 
 NODE = 3
-PATIENCE = 20  # s, for what takes well under one
 
 DRIVE = """
 period: 5 ms
@@ -32,33 +29,6 @@ blocks:
 """
 
 WATCHED = "drive.position,drive.velocity,drive.current,drive.enabled,drive.flag,drive.error,drive.abort,drive.sequence"
-
-Row = dict[str, Any]
-
-
-class Task:
-    """A running task and the rows that it prints."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process = process
-
-    def until(self, wanted: Callable[[Row], bool]) -> Row:
-        """The first row that is as wanted."""
-        assert self.process.stdout
-        deadline = time.monotonic() + PATIENCE
-        row: Row = {}
-        for line in self.process.stdout:
-            row = {name.removeprefix("drive."): value for name, value in json.loads(line).items()}
-            if wanted(row):
-                return row
-            assert time.monotonic() < deadline, f"not within {PATIENCE} s; the last row was {row}"
-        raise AssertionError(f"the task ended, status {self.process.wait()}; the last row was {row}")
-
-    def end(self) -> int:
-        self.process.send_signal(signal.SIGTERM)
-        assert self.process.stdout
-        self.process.stdout.read()
-        return self.process.wait(PATIENCE)
 
 
 @pytest.fixture(scope="module")
@@ -79,19 +49,10 @@ def hub() -> Iterator[UdpHub]:
 
 @pytest.fixture
 def start(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path) -> Callable[..., Any]:
-    @contextmanager
-    def run(text: str, watched: str = WATCHED) -> Iterator[Task]:
-        path = tmp_path / "task.yml"
-        path.write_text(text)
-        environment = {**os.environ, "LD_PRELOAD": str(udp_can), "CAN_HUB": str(hub.port)}
-        command = [str(flotilla_run), "--watch", watched, str(path)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-            try:
-                yield Task(process)
-            finally:
-                process.kill()
-
-    return run
+    environment = {"LD_PRELOAD": str(udp_can), "CAN_HUB": str(hub.port)}
+    return lambda text, watched=WATCHED: running(
+        [flotilla_run, "--watch", watched], tmp_path / "task.yml", text, environment
+    )
 
 
 def drive_task(mode: str, target: float, more: str = "") -> str:

@@ -2,79 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
 import subprocess
-import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from images.builder import paths
 from tests.emulators.igps import Faults, Igps
-
-PATIENCE = 20
-"""Seconds, for what takes well under one."""
-
-Row = dict[str, Any]
-
-
-class Task:
-    """A running task and the rows that it prints."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process = process
-
-    def rows(self) -> Iterator[Row]:
-        assert self.process.stdout
-        deadline = time.monotonic() + PATIENCE
-        for line in self.process.stdout:
-            assert time.monotonic() < deadline, f"not within {PATIENCE} s; the last row was {line}"
-            yield {name.rpartition(".")[2]: value for name, value in json.loads(line).items()}
-
-    def until(self, wanted: Callable[[Row], bool]) -> Row:
-        """The first row that is as wanted."""
-        row: Row = {}
-        for row in self.rows():
-            if wanted(row):
-                return row
-        raise AssertionError(f"the task ended, status {self.process.wait()}; the last row was {row}")
-
-    def end(self) -> int:
-        self.process.send_signal(signal.SIGTERM)
-        assert self.process.stdout
-        self.process.stdout.read()
-        return self.process.wait(PATIENCE)
-
+from tests.running import PATIENCE, Task, running
 
 Start = Callable[..., AbstractContextManager[Task]]
 
 
-@pytest.fixture(scope="module")
-def flotilla_run() -> Path:
-    """Built by: meson setup build/runtime runtime; ninja -C build/runtime"""
-    return paths.BUILD / "runtime" / "flotilla-run"
-
-
 @pytest.fixture
 def start(flotilla_run: Path, tmp_path: Path) -> Start:
-    @contextmanager
-    def run(name: str, text: str, *options: str) -> Iterator[Task]:
-        path = tmp_path / f"{name}.yml"
-        path.write_text(text)
-        command = [str(flotilla_run), *options, str(path)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            try:
-                yield Task(process)
-            finally:
-                process.kill()
-
-    return run
+    return lambda name, text, *options: running([flotilla_run, *options], tmp_path / f"{name}.yml", text)
 
 
 @pytest.fixture

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -18,51 +16,20 @@ from tests.emulators.micromag3 import MicroMag3
 from tests.emulators.oceanserver import Battery, OceanServer
 from tests.emulators.serial_line import Faults, SerialLine
 from tests.emulators.urg import Urg
-
-TIMEOUT = 60.0
-"""Until something that is waited for is given up: far more than it takes, because the machine may be busy."""
-
-Row = dict[str, Any]
+from tests.running import PATIENCE, Row, Task, running
 
 
-class Run:
-    """A task that runs, and the rows that it prints, one for each step."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self._process = process
-
-    def rows(self) -> Iterator[Row]:
-        assert self._process.stdout
-        end = time.monotonic() + TIMEOUT
-        for line in self._process.stdout:
-            assert time.monotonic() < end, f"in vain; the last row is {line}"
-            row = json.loads(line)
-            yield {name.removeprefix("sensor."): value for name, value in row.items()}
-        pytest.fail("the task has ended")
-
-    def until(self, condition: Callable[[Row], object]) -> Row:
-        """The next row of which it is true."""
-        return next(row for row in self.rows() if condition(row))
-
-
-@contextmanager
-def running(
+def watching(
     binary: Path, directory: Path, line: SerialLine, block: str, *outputs: str, **parameters: Any
-) -> Iterator[Run]:
+) -> AbstractContextManager[Task]:
     """Run a task of one block every 10 ms, or as often as a busy machine can, and watch it."""
     written = {"device": line.path, **parameters}
-    task = directory / "task.yml"
-    task.write_text(
+    text = (
         "period: 10 ms\npriority: 0\noverrun: skip\noverruns: 0\nblocks:\n  sensor:\n"
         f"    type: {block}\n    parameters: {json.dumps(written)}\n"
     )
     watched = ",".join(f"sensor.{output}" for output in (*outputs, "flag", "age", "sequence"))
-    with subprocess.Popen([binary, task, "--watch", watched], stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield Run(process)
-        finally:
-            process.terminate()
-            process.communicate(timeout=TIMEOUT)
+    return running([binary, "--watch", watched], directory / "task.yml", text)
 
 
 def good(row: Row) -> bool:
@@ -78,7 +45,7 @@ def test_gyro_through_faults_and_unplugging(flotilla_run: Path, tmp_path: Path, 
     gyro = Dsp3000(lambda seconds: 90.0, format)
     # The timeout is long, so that a busy machine is not taken for a fault; the flag must fall by what is wrong.
     parameters = {"baud": baud, "format": format, "timeout": 5, "positive": "counterclockwise"}
-    with SerialLine(gyro) as line, running(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run:
+    with SerialLine(gyro) as line, watching(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run:
         row = run.until(good)
         assert row["rate"] == pytest.approx(-math.pi / 2, abs=0.01)
         assert run.until(lambda later: later["sequence"] > row["sequence"] + 50)["age"] < 5
@@ -120,7 +87,7 @@ def test_gyros_words_survive_faults(flotilla_run: Path, tmp_path: Path, faults: 
     parameters = {"baud": 115200, "format": "words", "timeout": 5}
     with (
         SerialLine(gyro, faults=faults, seed=7) as line,
-        running(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run,
+        watching(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run,
     ):
         rates: dict[int, float] = {}  # by sequence: a step may see the same measurement again
         while len(rates) < 100:
@@ -133,7 +100,7 @@ def test_gyro_counts_increments_although_its_rate_beats_against_the_tasks(flotil
     gyro = Dsp3000(lambda seconds: 90.0, noise=0)
     with (
         SerialLine(gyro) as line,
-        running(flotilla_run, tmp_path, line, "dsp3000", "increment", mode="incremental", timeout=5) as run,
+        watching(flotilla_run, tmp_path, line, "dsp3000", "increment", mode="incremental", timeout=5) as run,
     ):
         first = run.until(good)
         turned = 0.0
@@ -148,13 +115,13 @@ def test_gyro_counts_increments_although_its_rate_beats_against_the_tasks(flotil
 
 def test_wrong_baud_is_never_good(flotilla_run: Path, tmp_path: Path) -> None:
     with SerialLine(Dsp3000(lambda seconds: 90.0)) as line:
-        with running(flotilla_run, tmp_path, line, "dsp3000", "rate", baud=57600, timeout=5) as run:
+        with watching(flotilla_run, tmp_path, line, "dsp3000", "rate", baud=57600, timeout=5) as run:
             sent = line.sent
             for row in run.rows():
                 assert not row["flag"]
                 if line.sent > sent + 100:
                     break
-        with running(flotilla_run, tmp_path, line, "dsp3000", "rate", baud=38400, timeout=5) as run:
+        with watching(flotilla_run, tmp_path, line, "dsp3000", "rate", baud=38400, timeout=5) as run:
             run.until(good)
 
 
@@ -162,7 +129,7 @@ def test_magnetometer(flotilla_run: Path, tmp_path: Path) -> None:
     compass = MicroMag3(noise=0)
     with (
         SerialLine(compass) as line,
-        running(flotilla_run, tmp_path, line, "micromag3", "heading", "field", "error", pollfreq=16, timeout=3) as run,
+        watching(flotilla_run, tmp_path, line, "micromag3", "heading", "field", "error", pollfreq=16, timeout=3) as run,
     ):
         row = run.until(good)
         assert row["heading"] == pytest.approx(math.radians(194.74))
@@ -186,7 +153,7 @@ def test_magnetometer_with_unknown_checksums(flotilla_run: Path, tmp_path: Path)
     parameters = {"mode": "poll", "checksum": "none", "timeout": 5}
     with (
         SerialLine(MicroMag3(noise=0, sums="unknown")) as line,
-        running(flotilla_run, tmp_path, line, "micromag3", "heading", **parameters) as run,
+        watching(flotilla_run, tmp_path, line, "micromag3", "heading", **parameters) as run,
     ):
         first = run.until(good)["sequence"]
         run.until(lambda row: row["sequence"] > first + 3)
@@ -196,7 +163,7 @@ def test_batteries(flotilla_run: Path, tmp_path: Path) -> None:
     controller = OceanServer({1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}, charging=4)
     with (
         SerialLine(controller) as line,
-        running(
+        watching(
             flotilla_run, tmp_path, line, "oceanserver", "charge", "present", "charging", "voltage", "current",
             "temperature", "charges", timeout=4,
         ) as run,
@@ -221,7 +188,7 @@ def test_laser_scanner(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
     scanner = Urg(lambda step, seconds: 7 if step == 50 else 1000 + step, old=True, noise=0)
     parameters = {"first_step": 44, "last_step": 143, "mode": mode, "timeout": 5}
     with SerialLine(scanner) as line:
-        with running(flotilla_run, tmp_path, line, "urg", "ranges", "timestamp", **parameters) as run:
+        with watching(flotilla_run, tmp_path, line, "urg", "ranges", "timestamp", **parameters) as run:
             row = run.until(good)
             assert len(row["ranges"]) == 100
             assert row["ranges"][6] is None  # an error code: not a number
@@ -237,7 +204,7 @@ def test_laser_scanner(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
             line.replug()
             run.until(good)
             assert scanner.laser
-        end = time.monotonic() + TIMEOUT
+        end = time.monotonic() + PATIENCE
         while scanner.laser:  # the task has ended, and said so
             assert time.monotonic() < end
             time.sleep(0.01)

@@ -8,23 +8,13 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from images.builder import paths
 from runtime.station import recording
+from tests.running import PATIENCE, Row
 
-PATIENCE = 20
-"""Seconds, for what takes well under one."""
-
-Rows = list[dict[str, Any]]
-
-
-@pytest.fixture(scope="module")
-def flotilla_run() -> Path:
-    """Built by: meson setup build/runtime runtime; ninja -C build/runtime"""
-    return paths.BUILD / "runtime" / "flotilla-run"
+Rows = list[Row]
 
 
 @pytest.fixture

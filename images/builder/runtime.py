@@ -41,17 +41,9 @@ class Runtime:
 
 def compile_plugin(source: Path, architecture: str) -> bytes:
     """A C file as a plug-in with blocks for robots of an architecture; errors are the compiler's own words."""
-    lock = read_lock(f"runtime-{architecture}")
-    pool.fill([lock])
-    toolchain_tree = tools.tree(lock)
-    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".plugin-") as work:
-        shutil.copy(source, work)
-        shutil.copytree(SOURCE / "include", Path(work) / "include")
-        command = ["gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC", "-s", "-I/out/include"]
-        command += ["-Wl,--build-id=none", "-o", "/out/plugin.so", f"/out/{source.name}", "-lm"]
-        stage = {"tools": str(toolchain_tree), "epoch": lock.epoch, "out": work, "command": command}
-        namespace.run_stage(toolchain.__name__, [json.dumps(stage)], Path(work) / "log")
-        return (Path(work) / "plugin.so").read_bytes()
+    command = ["gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC", "-s", "-I/out/include"]
+    command += ["-Wl,--build-id=none"]
+    return toolchain.compile_by(f"runtime-{architecture}", command, [source, SOURCE / "include"], ["-lm"])
 
 
 def check_task(name: str, content: bytes) -> None:
@@ -66,22 +58,17 @@ def check_task(name: str, content: bytes) -> None:
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".task-") as directory:
         file = Path(directory) / f"{name}.yml"
         file.write_bytes(content)
-        argv = [str(tree / "lib64/ld-linux-x86-64.so.2"), "--library-path", str(tree / "usr/lib/x86_64-linux-gnu")]
-        argv += [
-            str(programs / "usr/bin/flotilla-run"),
-            "--check",
-            "--blocks",
-            str(programs / "usr/lib/flotilla/blocks"),
-        ]
-        done = subprocess.run([*argv, str(file)], capture_output=True, encoding="utf-8", check=False)
+        loader = f"{tree}/lib64/ld-linux-x86-64.so.2", "--library-path", f"{tree}/usr/lib/x86_64-linux-gnu"
+        check = f"{programs}/usr/bin/flotilla-run", "--check", "--blocks", f"{programs}/usr/lib/flotilla/blocks"
+        done = subprocess.run([*loader, *check, file], capture_output=True, encoding="utf-8", check=False)
         if done.returncode:
             raise UserError(done.stderr.replace(str(file), paths.shown(paths.TASKS / file.name)).strip())
 
 
 def sources() -> list[Path]:
-    """The files that decide what the packages hold."""
+    """The files that decide what the packages hold; those of linters, which are hidden, do not."""
     return sorted(
-        path for path in SOURCE.rglob("*") if path.is_file() and path.relative_to(SOURCE).parts[0] not in _LEFT_OUT
+        path for path in SOURCE.rglob("[!.]*") if path.is_file() and path.relative_to(SOURCE).parts[0] not in _LEFT_OUT
     )
 
 
@@ -98,13 +85,13 @@ def build(architecture: str) -> Runtime:
 
     def make(out: Path) -> None:
         pool.fill([lock])
-        toolchain = tools.tree(lock)
+        tree = tools.tree(lock)
         for path in sources():
             place = out / "source" / path.relative_to(SOURCE)
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, place)
         with progress.step(f"runtime for {architecture}"):
-            arguments = [str(toolchain), str(out), architecture, str(lock.epoch), json.dumps(LIBRARIES)]
+            arguments = [str(tree), str(out), architecture, str(lock.epoch), json.dumps(LIBRARIES)]
             log = paths.BUILD / f"runtime-{architecture}.log"
             namespace.run_stage(runtime_stage.__name__, arguments, log)
 

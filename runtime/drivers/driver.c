@@ -54,11 +54,6 @@ void fl_driver_stop(struct fl_driver *driver)
     close(driver->stop_fd);
 }
 
-int fl_driver_stop_fd(const struct fl_driver *driver)
-{
-    return driver->stop_fd;
-}
-
 int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int timeout_ms)
 {
     struct pollfd waiting[] = {{.fd = driver->stop_fd, .events = POLLIN},

@@ -101,9 +101,8 @@ static bool write_all(const struct fl_driver *driver, int fd, const uint8_t *byt
         if (written > 0) {
             bytes += written;
             count -= (size_t)written;
-        } else if (written < 0 && errno != EAGAIN && errno != EINTR) {
-            return false;
-        } else if (fl_driver_wait(driver, fd, true, STUCK_MS) <= 0) {
+        } else if ((written < 0 && errno != EAGAIN && errno != EINTR) ||
+                   fl_driver_wait(driver, fd, true, STUCK_MS) <= 0) {
             return false;
         }
     }

@@ -1,10 +1,9 @@
 #include "grabber.h"
 
-#include <math.h>
 #include <stdatomic.h>
 #include <string.h>
 
-enum { IMAGE, FLAG, AGE, SEQUENCE };
+enum { IMAGE, FLAG };
 
 int grabber_configure(struct fl_block *block, int64_t width, int64_t height)
 {
@@ -26,7 +25,7 @@ int grabber_start(struct fl_block *block, struct grabber *grabber, int64_t width
 {
     grabber->parameters = block->parameters;
     grabber->bytes = (size_t)(width * height);
-    grabber->taken_ns = fl_now_ns();
+    fl_sensor_begin(&grabber->sensor);
     if (frames_allocate(block, &grabber->frames, grabber->bytes) != FL_OK)
         return FL_FAILED;
     grabber->driver = fl_driver_start(block, run, grabber);
@@ -38,14 +37,9 @@ void grabber_step(struct fl_block *block, struct grabber *grabber, double timeou
     const struct frame *frame = frames_newest(&grabber->frames);
     if (frame) {
         memcpy(block->out[IMAGE], frame->pixels, grabber->bytes);
-        grabber->taken_ns = frame->at_ns;
-        grabber->sequence = frame->sequence;
+        fl_sensor_update(&grabber->sensor, frame->at_ns, frame->sequence);
     }
-    int64_t age_ns = block->release_ns > grabber->taken_ns ? block->release_ns - grabber->taken_ns : 0;
-    FL_OUT(block, FLAG, uint8_t) =
-        grabber->sequence && atomic_load(&grabber->connected) && age_ns <= llround(timeout * 1e9);
-    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
-    FL_OUT(block, SEQUENCE, uint32_t) = grabber->sequence;
+    fl_sensor_outputs(&grabber->sensor, block, FLAG, atomic_load(&grabber->connected), timeout);
 }
 
 void grabber_stop(struct grabber *grabber)

@@ -9,6 +9,7 @@
 #include "frames.h"
 
 #include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 
 enum { GRABBER_SIDE = 2048 }; /* largest width and height: 12 MiB of buffers at most */
 
@@ -21,8 +22,7 @@ enum { GRABBER_SIDE = 2048 }; /* largest width and height: 12 MiB of buffers at 
                  .summary = "of the image"),                                                                           \
         FL_PARAMETER(type, height, .fallback = "480", .min = 16, .max = GRABBER_SIDE, .unit = "pixel",                 \
                      .summary = "of the image"),                                                                       \
-        FL_PARAMETER(type, timeout, .fallback = "0.5", .min = 1e-6, .max = 1e6, .unit = "s",                           \
-                     .summary = "age at which an image is no longer good")
+        FL_SENSOR_TIMEOUT(type, "0.5")
 
 struct grabber {
     struct frames frames;
@@ -30,8 +30,7 @@ struct grabber {
     const void *parameters;
     size_t bytes;
     _Atomic bool connected; /* the thread's: the camera streams */
-    int64_t taken_ns;
-    uint32_t sequence;
+    struct fl_sensor sensor;
 };
 
 /* Add the outputs image, flag, age and sequence. */

@@ -145,7 +145,7 @@ static bool take(dc1394camera_t *camera, struct grabber *grabber)
         return true;
     if (fits(camera, frame, set)) {
         uint8_t *to = frames_back(&grabber->frames);
-        for (uint32_t row = 0; row < frame->size[1]; row++)
+        for (size_t row = 0; row < frame->size[1]; row++)
             memcpy(to + row * frame->size[0], frame->image + row * frame->stride, frame->size[0]);
         frames_publish(&grabber->frames, taken_ns(frame));
     }

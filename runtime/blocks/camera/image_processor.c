@@ -1,7 +1,7 @@
 /* The block `image-processor`: where the bright spots of an image are. */
 #include "spots.h"
 
-#include <flotilla/driver.h>
+#include <flotilla/block.h>
 #include <string.h>
 
 struct image_processor {

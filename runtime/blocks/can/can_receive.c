@@ -1,7 +1,6 @@
 #include "socket.h"
 
-#include <flotilla/driver.h>
-#include <math.h>
+#include <flotilla/sensor.h>
 #include <string.h>
 
 struct can_receive {
@@ -13,8 +12,7 @@ struct can_receive {
 
 struct received {
     struct can_socket can;
-    int64_t arrived_ns; /* of the last frame; before the first, when the block started */
-    uint32_t sequence;
+    struct fl_sensor sensor;
 };
 
 static const struct fl_parameter parameters[] = {
@@ -23,11 +21,10 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct can_receive, mask, .fallback = "0x1FFFFFFF", .min = 0, .max = CAN_EFF_MASK,
                  .summary = "bits of the identifier that must be as in `id`"),
     FL_PARAMETER(struct can_receive, extended, .fallback = "false", .summary = "identifiers of 29 bits instead of 11"),
-    FL_PARAMETER(struct can_receive, timeout, .fallback = "1", .min = 1e-6, .max = 1e6, .unit = "s",
-                 .summary = "age at which a frame is no longer good"),
+    FL_SENSOR_TIMEOUT(struct can_receive, "1"),
 };
 
-enum { DATA, LENGTH, IDENTIFIER, FLAG, AGE, SEQUENCE };
+enum { DATA, LENGTH, IDENTIFIER, FLAG };
 static const struct fl_port outputs[] = {
     {.name = "data",
      .type = FL_UINT8,
@@ -55,7 +52,7 @@ static int start(struct fl_block *block)
         .can_id = (canid_t)set->id | (set->extended ? CAN_EFF_FLAG : 0),
         .can_mask = ((canid_t)set->mask & (set->extended ? CAN_EFF_MASK : CAN_SFF_MASK)) | CAN_EFF_FLAG | CAN_RTR_FLAG,
     };
-    received->arrived_ns = fl_now_ns();
+    fl_sensor_begin(&received->sensor);
     return can_open(block, &received->can, set->interface, &filter, 1);
 }
 
@@ -65,18 +62,15 @@ static int step(struct fl_block *block)
     const struct can_receive *set = block->parameters;
     struct received *received = block->state;
     struct can_frame frame;
-    for (int i = 0; i < FRAMES && can_receive(&received->can, &frame, &received->arrived_ns); i++) {
+    int64_t arrived_ns;
+    for (int i = 0; i < FRAMES && can_receive(&received->can, &frame, &arrived_ns); i++) {
         memset(block->out[DATA], 0, CAN_MAX_DLEN);
         memcpy(block->out[DATA], frame.data, frame.len);
         FL_OUT(block, LENGTH, uint8_t) = frame.len;
         FL_OUT(block, IDENTIFIER, uint32_t) = frame.can_id & CAN_EFF_MASK;
-        received->sequence++;
+        fl_sensor_update(&received->sensor, arrived_ns, received->sensor.sequence + 1);
     }
-    int64_t age_ns = block->release_ns > received->arrived_ns ? block->release_ns - received->arrived_ns : 0;
-    FL_OUT(block, FLAG, uint8_t) =
-        received->sequence && !received->can.bus_off && age_ns <= llround(set->timeout * 1e9);
-    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
-    FL_OUT(block, SEQUENCE, uint32_t) = received->sequence;
+    fl_sensor_outputs(&received->sensor, block, FLAG, !received->can.bus_off, set->timeout);
     return FL_OK;
 }
 

@@ -3,7 +3,7 @@
 #include "epos2.h"
 #include "socket.h"
 
-#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 #include <math.h>
 
 struct epos2_block {
@@ -17,8 +17,8 @@ struct epos2_block {
 struct state {
     struct can_socket can;
     struct epos2 drive;
+    struct fl_sensor sensor;
     bool open;
-    int64_t started_ns;
 };
 
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
@@ -62,7 +62,7 @@ static const struct fl_port inputs[] = {
      .summary = "age of the command, which is as good as none beyond `timeout`; without a wire it is always new"},
 };
 
-enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, FLAG, AGE, SEQUENCE };
+enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, FLAG };
 static const struct fl_port outputs[] = {
     {.name = "position", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "of the gear's output"},
     {.name = "velocity", .type = FL_DOUBLE, .width = 1, .unit = "rad/s", .summary = "of the gear's output"},
@@ -125,7 +125,7 @@ static int start(struct fl_block *block)
     if (can_open(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS) != FL_OK)
         return FL_FAILED;
     state->open = true;
-    state->started_ns = fl_now_ns();
+    fl_sensor_begin(&state->sensor);
     return FL_OK;
 }
 
@@ -136,24 +136,20 @@ static void send_all(struct state *state, const struct can_frame *frames, size_t
         can_send(&state->can, &frames[i]);
 }
 
-static void show(struct fl_block *block, const struct state *state)
+static void show(struct fl_block *block, struct state *state)
 {
     const struct epos2_block *set = block->parameters;
     const struct epos2 *drive = &state->drive;
-    int64_t from_ns = drive->sequence ? drive->values_ns : state->started_ns;
-    int64_t age_ns = block->release_ns > from_ns ? block->release_ns - from_ns : 0;
-    bool good = drive->sequence && drive->phase == EPOS2_RUNNING && !state->can.bus_off &&
-                age_ns <= llround(set->timeout * 1e9);
+    if (drive->sequence != state->sensor.sequence)
+        fl_sensor_update(&state->sensor, drive->values_ns, drive->sequence);
+    fl_sensor_outputs(&state->sensor, block, FLAG, drive->phase == EPOS2_RUNNING && !state->can.bus_off, set->timeout);
     FL_OUT(block, POSITION, double) = drive->values.position;
     FL_OUT(block, VELOCITY, double) = drive->values.velocity;
     FL_OUT(block, CURRENT, double) = drive->values.current;
     FL_OUT(block, STATUS, uint16_t) = drive->status_word;
     FL_OUT(block, ERROR, uint16_t) = drive->error_code;
     FL_OUT(block, ABORT, uint32_t) = drive->abort_code;
-    FL_OUT(block, ENABLED, uint8_t) = good && epos2_enabled(drive);
-    FL_OUT(block, FLAG, uint8_t) = good;
-    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
-    FL_OUT(block, SEQUENCE, uint32_t) = drive->sequence;
+    FL_OUT(block, ENABLED, uint8_t) = FL_OUT(block, FLAG, bool) && epos2_enabled(drive);
 }
 
 static int step(struct fl_block *block)

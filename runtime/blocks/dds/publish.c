@@ -8,7 +8,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { WAITING = 4, RETRY_MS = 1000 };
+enum { WAITING = 4 };
 
 struct state {
     struct dds_settings settings;
@@ -53,42 +53,23 @@ static void write_newest(struct state *state, dds_entity_t writer)
         atomic_fetch_add(&state->written, 1);
 }
 
-/* Until the thread shall return: true; or false when DDS cannot be had now. */
-static bool publish(struct state *state, struct fl_driver *driver, dds_entity_t participant)
+static void set_listener(dds_listener_t *listener)
 {
-    dds_listener_t *listener = dds_create_listener(state);
-    dds_qos_t *qualities = dds_qualities(&state->settings);
     dds_lset_publication_matched(listener, matched);
-    dds_entity_t topic = dds_open_topic(&state->settings, participant);
-    dds_entity_t writer = topic < 0 ? topic : dds_create_writer(participant, topic, qualities, listener);
-    dds_delete_qos(qualities);
-    dds_delete_listener(listener);
-    if (writer < 0)
-        fl_log(state->block, "topic %s: %s", state->settings.topic, dds_strretcode(writer));
-    while (writer >= 0 && fl_driver_wait(driver, state->wake[1], false, -1) == 1)
+}
+
+static void serve(void *context, struct fl_driver *driver, dds_entity_t writer)
+{
+    struct state *state = context;
+    while (fl_driver_wait(driver, state->wake[1], false, -1) == 1)
         write_newest(state, writer);
-    if (writer >= 0)
-        dds_delete(writer);
-    if (topic >= 0)
-        dds_delete(topic);
-    return writer >= 0;
 }
 
 static void run(struct fl_driver *driver, void *context)
 {
+    static const struct dds_endpoint endpoint = {dds_create_writer, set_listener, serve};
     struct state *state = context;
-    uint32_t domain = (uint32_t)state->settings.domain;
-    do {
-        dds_entity_t participant = dds_participant(domain);
-        if (participant < 0) {
-            fl_log(state->block, "DDS domain %u: %s", (unsigned)domain, dds_strretcode(participant));
-            continue;
-        }
-        bool done = publish(state, driver, participant);
-        dds_release_participant(domain);
-        if (done)
-            return;
-    } while (fl_driver_wait(driver, -1, false, RETRY_MS) == 0);
+    dds_run(&endpoint, &state->settings, state->block, driver, state);
 }
 
 static int configure(struct fl_block *block)

@@ -1,11 +1,11 @@
 #define _GNU_SOURCE
 #include "topic.h"
 
-#include <math.h>
+#include <flotilla/sensor.h>
 #include <stdatomic.h>
 #include <string.h>
 
-enum { WAITING = 16, RETRY_MS = 1000, BATCH = 8 };
+enum { WAITING = 16, BATCH = 8 };
 
 struct dds_subscribe {
     struct dds_settings common;
@@ -20,17 +20,15 @@ struct state {
     struct dds_sample arriving, taken; /* DDS's thread's, the step's */
     _Atomic uint32_t peers;
     _Atomic bool late; /* the deadline passed since the last sample */
-    int64_t arrived_ns;
-    uint32_t sequence;
+    struct fl_sensor sensor;
 };
 
 static const struct fl_parameter parameters[] = {
     DDS_PARAMETERS(struct dds_settings),
-    FL_PARAMETER(struct dds_subscribe, timeout, .fallback = "0.1", .min = 1e-6, .max = 1e6, .unit = "s",
-                 .summary = "age at which a sample is no longer good"),
+    FL_SENSOR_TIMEOUT(struct dds_subscribe, "0.1"),
 };
 
-enum { VALUES, NUMBER, STAMP, PEERS, FLAG, AGE, SEQUENCE };
+enum { VALUES, NUMBER, STAMP, PEERS, FLAG };
 
 static void matched(dds_entity_t reader, const dds_subscription_matched_status_t status, void *context)
 {
@@ -69,44 +67,26 @@ static void arrived(dds_entity_t reader, void *context)
     }
 }
 
-/* Until the thread shall return: true; or false when DDS cannot be had now. */
-static bool subscribe(struct state *state, struct fl_driver *driver, dds_entity_t participant)
+static void set_listener(dds_listener_t *listener)
 {
-    dds_listener_t *listener = dds_create_listener(state);
-    dds_qos_t *qualities = dds_qualities(&state->settings);
     dds_lset_data_available(listener, arrived);
     dds_lset_subscription_matched(listener, matched);
     dds_lset_requested_deadline_missed(listener, missed);
-    dds_entity_t topic = dds_open_topic(&state->settings, participant);
-    dds_entity_t reader = topic < 0 ? topic : dds_create_reader(participant, topic, qualities, listener);
-    dds_delete_qos(qualities);
-    dds_delete_listener(listener);
-    if (reader < 0)
-        fl_log(state->block, "topic %s: %s", state->settings.topic, dds_strretcode(reader));
-    else
-        fl_driver_wait(driver, -1, false, -1);
-    if (reader >= 0)
-        dds_delete(reader); /* waits for a listener that is being called */
-    if (topic >= 0)
-        dds_delete(topic);
-    return reader >= 0;
+}
+
+/* DDS's own thread calls the listener. */
+static void serve(void *context, struct fl_driver *driver, dds_entity_t reader)
+{
+    (void)context;
+    (void)reader;
+    fl_driver_wait(driver, -1, false, -1);
 }
 
 static void run(struct fl_driver *driver, void *context)
 {
+    static const struct dds_endpoint endpoint = {dds_create_reader, set_listener, serve};
     struct state *state = context;
-    uint32_t domain = (uint32_t)state->settings.domain;
-    do {
-        dds_entity_t participant = dds_participant(domain);
-        if (participant < 0) {
-            fl_log(state->block, "DDS domain %u: %s", (unsigned)domain, dds_strretcode(participant));
-            continue;
-        }
-        bool done = subscribe(state, driver, participant);
-        dds_release_participant(domain);
-        if (done)
-            return;
-    } while (fl_driver_wait(driver, -1, false, RETRY_MS) == 0);
+    dds_run(&endpoint, &state->settings, state->block, driver, state);
 }
 
 static int configure(struct fl_block *block)
@@ -132,7 +112,7 @@ static int start(struct fl_block *block)
         return FL_FAILED;
     state->settings = ((const struct dds_subscribe *)block->parameters)->common;
     state->block = block;
-    state->arrived_ns = fl_now_ns();
+    fl_sensor_begin(&state->sensor);
     fl_ring_initialize(&state->samples, memory, sizeof(struct dds_sample), WAITING);
     state->driver = fl_driver_start(block, run, state);
     return state->driver ? FL_OK : FL_FAILED;
@@ -146,15 +126,10 @@ static int step(struct fl_block *block)
         memcpy(block->out[VALUES], state->taken.values, dds_value_bytes(&state->settings));
         FL_OUT(block, NUMBER, uint32_t) = state->taken.number;
         FL_OUT(block, STAMP, int64_t) = state->taken.stamp_ns;
-        state->arrived_ns = state->taken.arrived_ns;
-        state->sequence++;
+        fl_sensor_update(&state->sensor, state->taken.arrived_ns, state->sensor.sequence + 1);
     }
-    int64_t age_ns = block->release_ns > state->arrived_ns ? block->release_ns - state->arrived_ns : 0;
     FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
-    FL_OUT(block, FLAG, uint8_t) =
-        state->sequence && !atomic_load(&state->late) && age_ns <= llround(set->timeout * 1e9);
-    FL_OUT(block, AGE, double) = (double)age_ns * 1e-9;
-    FL_OUT(block, SEQUENCE, uint32_t) = state->sequence;
+    fl_sensor_outputs(&state->sensor, block, FLAG, !atomic_load(&state->late), set->timeout);
     return FL_OK;
 }
 

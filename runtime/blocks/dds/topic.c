@@ -100,7 +100,8 @@ static struct {
     dds_entity_t participant;
 } participants[DOMAINS];
 
-dds_entity_t dds_participant(uint32_t domain)
+/* Made by the first that asks; negative: a DDS error. Each success is to be released. */
+static dds_entity_t have_participant(uint32_t domain)
 {
     dds_entity_t result = DDS_RETCODE_OUT_OF_RESOURCES;
     int slot = -1;
@@ -118,7 +119,7 @@ dds_entity_t dds_participant(uint32_t domain)
     return result;
 }
 
-void dds_release_participant(uint32_t domain)
+static void release_participant(uint32_t domain)
 {
     pthread_mutex_lock(&lock);
     for (int i = 0; i < DOMAINS; i++)
@@ -127,14 +128,11 @@ void dds_release_participant(uint32_t domain)
     pthread_mutex_unlock(&lock);
 }
 
-/* --- topics --- */
+/* --- endpoints --- */
 
-dds_entity_t dds_open_topic(const struct dds_settings *settings, dds_entity_t participant)
-{
-    return dds_create_topic(participant, types[settings->type].descriptor, settings->topic, NULL, NULL);
-}
+enum { RETRY_MS = 1000 };
 
-dds_qos_t *dds_qualities(const struct dds_settings *settings)
+static dds_qos_t *qualities_of(const struct dds_settings *settings)
 {
     dds_qos_t *qualities = dds_create_qos();
     dds_qset_history(qualities, DDS_HISTORY_KEEP_LAST, 1); /* control wants the newest or none */
@@ -143,4 +141,43 @@ dds_qos_t *dds_qualities(const struct dds_settings *settings)
     if (settings->deadline > 0)
         dds_qset_deadline(qualities, llround(settings->deadline * 1e9));
     return qualities;
+}
+
+/* Until the thread shall return: true; or false when DDS cannot be had now. */
+static bool serve(const struct dds_endpoint *endpoint, const struct dds_settings *settings, struct fl_block *block,
+                  struct fl_driver *driver, void *context, dds_entity_t participant)
+{
+    dds_listener_t *listener = dds_create_listener(context);
+    dds_qos_t *qualities = qualities_of(settings);
+    endpoint->set_listener(listener);
+    dds_entity_t topic = dds_create_topic(participant, types[settings->type].descriptor, settings->topic, NULL, NULL);
+    dds_entity_t entity = topic < 0 ? topic : endpoint->create(participant, topic, qualities, listener);
+    dds_delete_qos(qualities);
+    dds_delete_listener(listener);
+    if (entity < 0) {
+        fl_log(block, "topic %s: %s", settings->topic, dds_strretcode(entity));
+    } else {
+        endpoint->serve(context, driver, entity);
+        dds_delete(entity); /* waits for a listener that is being called */
+    }
+    if (topic >= 0)
+        dds_delete(topic);
+    return entity >= 0;
+}
+
+void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, struct fl_block *block,
+             struct fl_driver *driver, void *context)
+{
+    uint32_t domain = (uint32_t)settings->domain;
+    do {
+        dds_entity_t participant = have_participant(domain);
+        if (participant < 0) {
+            fl_log(block, "DDS domain %u: %s", (unsigned)domain, dds_strretcode(participant));
+            continue;
+        }
+        bool done = serve(endpoint, settings, block, driver, context, participant);
+        release_participant(domain);
+        if (done)
+            return;
+    } while (fl_driver_wait(driver, -1, false, RETRY_MS) == 0);
 }

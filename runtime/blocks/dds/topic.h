@@ -20,12 +20,13 @@ struct dds_sample {
     _Alignas(8) uint8_t values[DDS_VALUES];
 };
 
-#define DDS_MEMBERS                                                                                                    \
-    int type;                                                                                                          \
-    const char *topic;                                                                                                 \
-    int64_t domain, bytes, robot;                                                                                      \
-    int reliability;                                                                                                   \
-    double deadline
+struct dds_settings {
+    int type;
+    const char *topic;
+    int64_t domain, bytes, robot;
+    int reliability;
+    double deadline;
+};
 
 #define DDS_PARAMETERS(block_type)                                                                                     \
     FL_PARAMETER(block_type, type, .choices = "state|wrench|valves|bytes",                                             \
@@ -41,10 +42,6 @@ struct dds_sample {
         FL_PARAMETER(block_type, deadline, .fallback = "0", .min = 0, .max = 1e6, .unit = "s",                         \
                      .summary = "longest time between samples that is promised, or asked for; 0: none")
 
-struct dds_settings {
-    DDS_MEMBERS;
-};
-
 /* The port that carries the type's values. */
 struct fl_port dds_port(const struct dds_settings *settings);
 
@@ -57,12 +54,16 @@ void dds_encode(const struct dds_settings *settings, const struct dds_sample *sa
 /* False: of another length. */
 bool dds_decode(const struct dds_settings *settings, const void *storage, struct dds_sample *sample);
 
-/* The participant of a domain, made by the first that asks; negative: a DDS error. Each success is to be released. */
-dds_entity_t dds_participant(uint32_t domain);
-void dds_release_participant(uint32_t domain);
+/* A writer or reader of a topic. */
+struct dds_endpoint {
+    dds_entity_t (*create)(dds_entity_t participant, dds_entity_t topic, const dds_qos_t *qualities,
+                           const dds_listener_t *listener);
+    void (*set_listener)(dds_listener_t *listener); /* say what is to be called, with the context given to dds_run */
+    void (*serve)(void *context, struct fl_driver *driver, dds_entity_t entity); /* until the thread shall return */
+};
 
-/* Topic and qualities for a writer or reader; the caller deletes both. Negative: a DDS error. */
-dds_entity_t dds_open_topic(const struct dds_settings *settings, dds_entity_t participant);
-dds_qos_t *dds_qualities(const struct dds_settings *settings);
+/* What a block's thread does: have the endpoint, and serve it; try again while DDS cannot be had. */
+void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, struct fl_block *block,
+             struct fl_driver *driver, void *context);
 
 #endif

@@ -1,8 +1,7 @@
 #include "igps_datagram.h"
-#include "sensor.h"
 #include "udp.h"
 
-#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 
 struct igps {
     UDP_RECEIVER_MEMBERS;
@@ -17,8 +16,7 @@ static const struct fl_parameter parameters[] = {
                  .summary = "order of the bytes of a number; the iGPS computer is a PC, so least significant first"),
     FL_PARAMETER(struct igps, range, .fallback = "100", .min = 0, .max = 1e6, .unit = "m",
                  .summary = "greatest coordinate that is believed, either sign"),
-    FL_PARAMETER(struct igps, timeout, .flags = FL_TUNABLE, .fallback = "0.1", .min = 0.001, .max = 3600, .unit = "s",
-                 .summary = "a value that is older is not good"),
+    FL_SENSOR_TIMEOUT(struct igps, "0.1"),
 };
 
 static const struct fl_port outputs[] = {
@@ -31,7 +29,7 @@ enum { POSITION, FLAG, AGE, SEQUENCE, DROPPED, REFUSED };
 
 struct state {
     struct udp_receiver receiver;
-    struct sensor sensor;
+    struct fl_sensor sensor;
 };
 
 static int configure(struct fl_block *block)
@@ -44,7 +42,7 @@ static int start(struct fl_block *block)
 {
     const struct igps *igps = block->parameters;
     struct state *state = block->state;
-    sensor_start(&state->sensor);
+    fl_sensor_begin(&state->sensor);
     return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from);
 }
 
@@ -60,14 +58,14 @@ static int step(struct fl_block *block)
         /* A right datagram with a number that cannot be is the system saying that it does not see the robot; one of
          * another length is not of the system, and says nothing. */
         if (!igps_read(bytes, sizeof bytes, (enum igps_byte_order)igps->byte_order, igps->range, &position)) {
-            state->sensor.good = false;
+            fl_sensor_invalidate(&state->sensor);
             continue;
         }
         ((double *)block->out[POSITION])[0] = position.x;
         ((double *)block->out[POSITION])[1] = position.y;
-        sensor_arrived(&state->sensor, arrived_ns);
+        fl_sensor_update(&state->sensor, arrived_ns, state->sensor.sequence + 1);
     }
-    sensor_outputs(&state->sensor, block, FLAG, igps->timeout);
+    fl_sensor_outputs(&state->sensor, block, FLAG, true, igps->timeout);
     FL_OUT(block, DROPPED, uint32_t) = state->receiver.dropped;
     FL_OUT(block, REFUSED, uint32_t) = state->receiver.refused;
     return FL_OK;

@@ -1,7 +1,6 @@
 #include "queue.h"
-#include "sensor.h"
 
-#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 #include <string.h>
 
 struct queue_receive {
@@ -16,8 +15,7 @@ static const struct fl_parameter parameters[] = {
     QUEUE_PARAMETERS(struct queue_receive),
     FL_PARAMETER(struct queue_receive, take, .fallback = "newest", .choices = "newest|in-order",
                  .summary = "each step takes the newest message, or the next one that waits"),
-    FL_PARAMETER(struct queue_receive, timeout, .flags = FL_TUNABLE, .fallback = "0.1", .min = 0.001, .max = 3600,
-                 .unit = "s", .summary = "a value that is older is not good"),
+    FL_SENSOR_TIMEOUT(struct queue_receive, "0.1"),
 };
 
 static const struct fl_port outputs[] = {
@@ -30,7 +28,7 @@ enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, DATA };
 
 struct state {
     struct queue queue;
-    struct sensor sensor;
+    struct fl_sensor sensor;
     uint32_t last; /* the sender's count; 0: none */
 };
 
@@ -49,7 +47,7 @@ static int start(struct fl_block *block)
 {
     const struct queue_receive *receive = block->parameters;
     struct state *state = block->state;
-    sensor_start(&state->sensor);
+    fl_sensor_begin(&state->sensor);
     if (queue_open(&state->queue, block, QUEUE_RECEIVER, receive->name, (enum fl_type)receive->type, receive->width,
                    receive->depth) != FL_OK)
         return FL_FAILED;
@@ -70,7 +68,7 @@ static void accept(struct fl_block *block, struct state *state)
         FL_OUT(block, DROPPED, uint32_t) += message->sequence - state->last - 1;
     state->last = message->sequence;
     memcpy(block->out[DATA], message->data, state->queue.data_bytes);
-    sensor_arrived(&state->sensor, message->sent_ns);
+    fl_sensor_update(&state->sensor, message->sent_ns, state->sensor.sequence + 1);
 }
 
 static int step(struct fl_block *block)
@@ -80,7 +78,7 @@ static int step(struct fl_block *block)
     int64_t most = receive->take == IN_ORDER ? 1 : receive->depth;
     for (int64_t i = 0; i < most && queue_take(&state->queue); i++)
         accept(block, state);
-    sensor_outputs(&state->sensor, block, FLAG, receive->timeout);
+    fl_sensor_outputs(&state->sensor, block, FLAG, true, receive->timeout);
     return FL_OK;
 }
 

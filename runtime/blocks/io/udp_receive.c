@@ -1,7 +1,6 @@
-#include "sensor.h"
 #include "udp.h"
 
-#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 #include <string.h>
 
 struct udp_receive {
@@ -19,8 +18,7 @@ static const struct fl_parameter parameters[] = {
                  .summary = "payload of a datagram; one of another length is refused"),
     FL_PARAMETER(struct udp_receive, take, .fallback = "newest", .choices = "newest|in-order",
                  .summary = "each step takes the newest datagram, or the next one that waits"),
-    FL_PARAMETER(struct udp_receive, timeout, .flags = FL_TUNABLE, .fallback = "0.1", .min = 0.001, .max = 3600,
-                 .unit = "s", .summary = "a value that is older is not good"),
+    FL_SENSOR_TIMEOUT(struct udp_receive, "0.1"),
 };
 
 static const struct fl_port outputs[] = {
@@ -32,7 +30,7 @@ enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, DATA };
 
 struct state {
     struct udp_receiver receiver;
-    struct sensor sensor;
+    struct fl_sensor sensor;
     uint8_t *scratch;
 };
 
@@ -51,7 +49,7 @@ static int start(struct fl_block *block)
 {
     const struct udp_receive *udp = block->parameters;
     struct state *state = block->state;
-    sensor_start(&state->sensor);
+    fl_sensor_begin(&state->sensor);
     state->scratch = fl_allocate(block, (size_t)udp->length);
     if (!state->scratch)
         return FL_FAILED;
@@ -66,11 +64,11 @@ static int step(struct fl_block *block)
     int budget = UDP_BURST;
     while (udp_receive(&state->receiver, state->scratch, (size_t)udp->length, &arrived_ns, &budget)) {
         memcpy(block->out[DATA], state->scratch, (size_t)udp->length);
-        sensor_arrived(&state->sensor, arrived_ns);
+        fl_sensor_update(&state->sensor, arrived_ns, state->sensor.sequence + 1);
         if (udp->take == IN_ORDER)
             break;
     }
-    sensor_outputs(&state->sensor, block, FLAG, udp->timeout);
+    fl_sensor_outputs(&state->sensor, block, FLAG, true, udp->timeout);
     FL_OUT(block, DROPPED, uint32_t) = state->receiver.dropped;
     FL_OUT(block, REFUSED, uint32_t) = state->receiver.refused;
     return FL_OK;

@@ -1,12 +1,13 @@
 #include "dsp3000_frame.h"
-#include "sensor.h"
 
+#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 #include <math.h>
 
 enum { TEXT, WORDS };
 enum { CLOCKWISE, COUNTERCLOCKWISE };
 enum { IN_ZERO };
-enum { OUT_VALUE };
+enum { OUT_VALUE, OUT_FLAG };
 
 enum {
     REPEATS = 3, /* of a command: the gyro takes it between two of its frames, or misses it */
@@ -31,7 +32,7 @@ static const struct fl_parameter parameters[] = {
                  .summary = "sense of rotation, seen from above, that is positive; clockwise is the gyro's own"),
     FL_PARAMETER(struct dsp3000, full_scale, .fallback = "6.545", .min = 0.01, .max = 6.545, .unit = "rad/s",
                  .summary = "a faster rotation is not believed, whatever the gyro says"),
-    SENSOR_TIMEOUT(struct dsp3000, "0.05"),
+    FL_SENSOR_TIMEOUT(struct dsp3000, "0.05"),
 };
 
 static const struct fl_port inputs[] = {
@@ -119,12 +120,13 @@ static const struct fl_serial_protocol newest[] = {[TEXT] = PROTOCOL(0, feed_tex
 
 struct state {
     struct fl_serial *serial;
-    struct sensor sensor;
+    struct fl_sensor sensor;
     double radians;     /* of a degree, with the sign */
     double most;        /* degrees, or degrees per second, that are believed */
+    uint32_t heard;     /* measurements so far, bad ones too */
     bool zero;          /* the input of the last step */
     uint8_t zeros;      /* still to be sent, */
-    uint32_t zeroed_at; /* but not again at the same sequence */
+    uint32_t zeroed_at; /* but not again after the same measurement */
 };
 
 static int configure(struct fl_block *block)
@@ -155,7 +157,7 @@ static int initialize(struct fl_block *block)
     state->most = dsp3000->mode == DSP3000_RATE          ? full_scale
                   : dsp3000->mode == DSP3000_INCREMENTAL ? full_scale / slowest_hz
                                                          : 360;
-    sensor_begin(&state->sensor);
+    fl_sensor_begin(&state->sensor);
     return FL_OK;
 }
 
@@ -169,12 +171,15 @@ static void take_newest(struct fl_block *block, enum dsp3000_mode mode)
     struct state *state = block->state;
     struct dsp3000_sample sample;
     int64_t arrived_ns;
-    uint32_t sequence;
-    if (!fl_serial_newest(state->serial, &sample, &arrived_ns, &sequence))
+    if (!fl_serial_newest(state->serial, &sample, &arrived_ns, &state->heard))
         return;
+    if (!believable(state, &sample)) {
+        fl_sensor_invalidate(&state->sensor);
+        return;
+    }
     double value = sample.degrees * state->radians;
-    if (sensor_take(&state->sensor, believable(state, &sample), arrived_ns, sequence))
-        FL_OUT(block, OUT_VALUE, double) = mode == DSP3000_RATE ? value : remainder(value, 2 * PI);
+    FL_OUT(block, OUT_VALUE, double) = mode == DSP3000_RATE ? value : remainder(value, 2 * PI);
+    fl_sensor_update(&state->sensor, arrived_ns, state->heard);
 }
 
 /* The sum of all increments since the last step. One that is bad or lost leaves a sum that is wrong. */
@@ -187,9 +192,13 @@ static void take_each(struct fl_block *block)
     double sum = 0;
     bool good = true;
     while (fl_serial_next(state->serial, &sample, &arrived_ns, &sequence)) {
-        good = good && believable(state, &sample) && sequence == state->sensor.sequence + 1;
+        good = good && believable(state, &sample) && sequence == state->heard + 1;
         sum += sample.degrees * state->radians;
-        sensor_take(&state->sensor, good, arrived_ns, sequence);
+        state->heard = sequence;
+        if (good)
+            fl_sensor_update(&state->sensor, arrived_ns, sequence);
+        else
+            fl_sensor_invalidate(&state->sensor);
     }
     FL_OUT(block, OUT_VALUE, double) = good ? sum : 0;
 }
@@ -202,13 +211,12 @@ static void zero(struct fl_block *block)
     bool wanted = FL_IN(block, IN_ZERO, bool);
     if (wanted && !state->zero) {
         state->zeros = REPEATS;
-        state->zeroed_at = state->sensor.sequence - 1;
+        state->zeroed_at = state->heard - 1;
     }
     state->zero = wanted;
-    if (state->zeros && state->zeroed_at != state->sensor.sequence &&
-        fl_serial_send(state->serial, (const uint8_t *)"Z", 1)) {
+    if (state->zeros && state->zeroed_at != state->heard && fl_serial_send(state->serial, (const uint8_t *)"Z", 1)) {
         state->zeros--;
-        state->zeroed_at = state->sensor.sequence;
+        state->zeroed_at = state->heard;
     }
 }
 
@@ -222,7 +230,7 @@ static int step(struct fl_block *block)
         take_newest(block, (enum dsp3000_mode)dsp3000->mode);
     if (dsp3000->mode == DSP3000_INTEGRATED)
         zero(block);
-    sensor_outputs(&state->sensor, block, fl_serial_connected(state->serial), dsp3000->timeout);
+    fl_sensor_outputs(&state->sensor, block, OUT_FLAG, fl_serial_connected(state->serial), dsp3000->timeout);
     return FL_OK;
 }
 

@@ -1,11 +1,12 @@
 #include "micromag3_frame.h"
-#include "sensor.h"
 
+#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 #include <stdio.h>
 
 enum { XOR, NONE };
 enum { STREAM, POLL, RAW };
-enum { OUT_HEADING, OUT_FIELD, OUT_ERROR };
+enum { OUT_HEADING, OUT_FIELD, OUT_ERROR, OUT_FLAG };
 enum { SILENT_MS = 3000 }; /* longer than the slowest stream pauses: the board was switched on anew */
 
 static const double PI = 3.14159265358979323846;
@@ -27,7 +28,7 @@ static const struct fl_parameter parameters[] = {
                  .summary = "rate of the stream; 0 is one sample in two seconds"),
     FL_PARAMETER(struct micromag3, checksum, .fallback = "xor", .choices = "xor|none",
                  .summary = "none: whatever the board sends as checksum is taken"),
-    SENSOR_TIMEOUT(struct micromag3, "0.5"),
+    FL_SENSOR_TIMEOUT(struct micromag3, "0.5"),
 };
 
 static const struct fl_port outputs[] = {
@@ -103,7 +104,7 @@ static const struct fl_serial_protocol protocol = {
 
 struct state {
     struct fl_serial *serial;
-    struct sensor sensor;
+    struct fl_sensor sensor;
 };
 
 static int start(struct fl_block *block)
@@ -116,7 +117,7 @@ static int start(struct fl_block *block)
 
 static int initialize(struct fl_block *block)
 {
-    sensor_begin(&((struct state *)block->state)->sensor);
+    fl_sensor_begin(&((struct state *)block->state)->sensor);
     return FL_OK;
 }
 
@@ -129,14 +130,17 @@ static int step(struct fl_block *block)
     uint32_t sequence;
     if (fl_serial_newest(state->serial, &sample, &arrived_ns, &sequence)) {
         FL_OUT(block, OUT_ERROR, uint16_t) = sample.error;
-        if (sensor_take(&state->sensor, !sample.error, arrived_ns, sequence)) {
+        if (sample.error) {
+            fl_sensor_invalidate(&state->sensor);
+        } else {
             if (sample.contains & MICROMAG3_HEADING)
                 FL_OUT(block, OUT_HEADING, double) = sample.heading * PI / 180;
             for (int axis = 0; axis < 3 && sample.contains & MICROMAG3_FIELD; axis++)
                 ((double *)block->out[OUT_FIELD])[axis] = sample.field[axis];
+            fl_sensor_update(&state->sensor, arrived_ns, sequence);
         }
     }
-    sensor_outputs(&state->sensor, block, fl_serial_connected(state->serial), micromag3->timeout);
+    fl_sensor_outputs(&state->sensor, block, OUT_FLAG, fl_serial_connected(state->serial), micromag3->timeout);
     return FL_OK;
 }
 

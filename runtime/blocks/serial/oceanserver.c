@@ -1,5 +1,7 @@
 #include "oceanserver_frame.h"
-#include "sensor.h"
+
+#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 
 enum {
     OUT_CHARGE,
@@ -13,7 +15,8 @@ enum {
     OUT_VOLTAGE,
     OUT_CURRENT,
     OUT_TEMPERATURE,
-    OUT_CHARGES
+    OUT_CHARGES,
+    OUT_FLAG
 };
 
 struct oceanserver {
@@ -26,7 +29,7 @@ static const struct fl_parameter parameters[] = {
     FL_SERIAL_PARAMETERS(struct oceanserver, "19200"),
     FL_PARAMETER(struct oceanserver, controller, .fallback = "1", .min = 1, .max = 9,
                  .summary = "which one's records are read, where several share the port"),
-    SENSOR_TIMEOUT(struct oceanserver, "10"),
+    FL_SENSOR_TIMEOUT(struct oceanserver, "10"),
 };
 
 #define MASK(named, said) {.name = (named), .type = FL_UINT8, .width = 1, .summary = "bit mask of batteries " said}
@@ -110,7 +113,7 @@ static const struct fl_serial_protocol protocol = {
 
 struct state {
     struct fl_serial *serial;
-    struct sensor sensor;
+    struct fl_sensor sensor;
     /* When which part arrived. The age is that of the oldest: what fails first is one battery's talk. */
     int64_t system_ns, controller_ns, battery_ns[OCEANSERVER_BATTERIES];
 };
@@ -125,7 +128,7 @@ static int start(struct fl_block *block)
 
 static int initialize(struct fl_block *block)
 {
-    sensor_begin(&((struct state *)block->state)->sensor);
+    fl_sensor_begin(&((struct state *)block->state)->sensor);
     return FL_OK;
 }
 
@@ -206,9 +209,13 @@ static int step(struct fl_block *block)
             take_controller(block, &sample, arrived_ns);
         else
             take_battery(block, &sample, arrived_ns);
-        sensor_take(&state->sensor, oldest(block) != 0, oldest(block), sequence);
+        int64_t oldest_ns = oldest(block);
+        if (oldest_ns)
+            fl_sensor_update(&state->sensor, oldest_ns, sequence);
+        else
+            fl_sensor_invalidate(&state->sensor);
     }
-    sensor_outputs(&state->sensor, block, fl_serial_connected(state->serial), oceanserver->timeout);
+    fl_sensor_outputs(&state->sensor, block, OUT_FLAG, fl_serial_connected(state->serial), oceanserver->timeout);
     return FL_OK;
 }
 

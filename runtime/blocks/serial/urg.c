@@ -1,10 +1,11 @@
-#include "sensor.h"
 #include "urg_frame.h"
 
+#include <flotilla/driver.h>
+#include <flotilla/sensor.h>
 #include <math.h>
 #include <stdio.h>
 
-enum { OUT_RANGES, OUT_TIMESTAMP };
+enum { OUT_RANGES, OUT_TIMESTAMP, OUT_FLAG };
 enum { STREAM, POLL };
 enum { DOUBLE, SINGLE };
 enum { NOT_A_NUMBER, ZERO };
@@ -35,7 +36,7 @@ static const struct fl_parameter parameters[] = {
                  .summary = "what is shorter is an error code: 0.02 of a URG-04LX, 0.006 of a UTM-30LX"),
     FL_PARAMETER(struct urg, max_range, .fallback = "5.6", .min = 0, .max = 262, .unit = "m",
                  .summary = "what is longer is no measurement"),
-    SENSOR_TIMEOUT(struct urg, "0.3"),
+    FL_SENSOR_TIMEOUT(struct urg, "0.3"),
 };
 
 static const struct fl_port timestamp = {
@@ -122,7 +123,7 @@ static const struct fl_serial_protocol protocol = {
 
 struct state {
     struct fl_serial *serial;
-    struct sensor sensor;
+    struct fl_sensor sensor;
     struct urg_scan scan;
 };
 
@@ -173,7 +174,7 @@ static int initialize(struct fl_block *block)
 {
     for (uint32_t point = 0; point < block->out_ports[OUT_RANGES].width; point++)
         set_range(block, point, invalid_range(block->parameters));
-    sensor_begin(&((struct state *)block->state)->sensor);
+    fl_sensor_begin(&((struct state *)block->state)->sensor);
     return FL_OK;
 }
 
@@ -194,10 +195,11 @@ static int step(struct fl_block *block)
     struct state *state = block->state;
     int64_t arrived_ns;
     uint32_t sequence;
-    if (fl_serial_newest(state->serial, &state->scan, &arrived_ns, &sequence) &&
-        sensor_take(&state->sensor, true, arrived_ns, sequence))
+    if (fl_serial_newest(state->serial, &state->scan, &arrived_ns, &sequence)) {
         take_scan(block, &state->scan);
-    sensor_outputs(&state->sensor, block, fl_serial_connected(state->serial), urg->timeout);
+        fl_sensor_update(&state->sensor, arrived_ns, sequence);
+    }
+    fl_sensor_outputs(&state->sensor, block, OUT_FLAG, fl_serial_connected(state->serial), urg->timeout);
     return FL_OK;
 }
 

@@ -21,20 +21,9 @@ struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_
 /* Ask the thread to return and wait for it. NULL is allowed. */
 void fl_driver_stop(struct fl_driver *driver);
 
-/* A descriptor that becomes readable when the thread shall return: poll it beside the device's. */
-int fl_driver_stop_fd(const struct fl_driver *driver);
-
 /* Wait until `fd` is readable (or writable with `writable`), at most `timeout_ms` (-1: for ever; fd -1: only wait).
  * 1 ready, 0 time-out, -1 the thread shall return, -2 the device is gone (hang-up or error). */
 int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int timeout_ms);
-
-/* --- sensors --- */
-
-/* The last outputs of every sensor block, after its values. */
-#define FL_SENSOR_OUTPUTS                                                                                              \
-    {.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: the value is good and not older than `timeout`"},  \
-        {.name = "age", .type = FL_DOUBLE, .width = 1, .unit = "s", .summary = "time since the value arrived"},        \
-        {.name = "sequence", .type = FL_UINT32, .width = 1, .summary = "values received so far"}
 
 /* --- serial port --- */
 
@@ -48,7 +37,8 @@ int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int ti
 
 #define FL_SERIAL_PARAMETERS(type, usual_baud)                                                                         \
     FL_PARAMETER(type, device, .summary = "serial port: /dev/robot/NAME"),                                             \
-        FL_PARAMETER(type, baud, .fallback = usual_baud, .min = 300, .max = 4000000, .unit = "Bd", .summary = "rate"), \
+        FL_PARAMETER(type, baud, .fallback = (usual_baud), .min = 300, .max = 4000000, .unit = "Bd",                   \
+                     .summary = "rate"),                                                                               \
         FL_PARAMETER(type, data_bits, .fallback = "8", .min = 5, .max = 8, .summary = "bits of a character"),          \
         FL_PARAMETER(type, stop_bits, .fallback = "1", .min = 1, .max = 2, .summary = "stop bits"),                    \
         FL_PARAMETER(type, parity, .fallback = "none", .choices = "none|odd|even", .summary = "parity bit")

@@ -55,6 +55,17 @@ static inline void line_say(const struct line *line, const char *text)
     line_write(line, text, strlen(text));
 }
 
+/* $, text, `end`, and the exclusive or of the text in hexadecimal; until the next call. */
+static inline const char *line_record(const char *text, char end)
+{
+    static char record[256];
+    unsigned sum = 0;
+    for (const char *at = text; *at; at++)
+        sum ^= (unsigned char)*at;
+    snprintf(record, sizeof record, "$%s%c%02X\r\n", text, end, sum);
+    return record;
+}
+
 /* Milliseconds until AWAIT is given up: far more than anything here takes, because the machine may be busy. */
 enum { AWAIT_MS = 20 * 1000 };
 

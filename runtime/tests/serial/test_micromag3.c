@@ -35,15 +35,9 @@ static void reads_the_published_record(void **state)
     }
 }
 
-/* Text with its checksum. */
 static const char *record_of(const char *text)
 {
-    static char record[256];
-    unsigned sum = 0;
-    for (const char *at = text; *at; at++)
-        sum ^= (unsigned char)*at;
-    snprintf(record, sizeof record, "$%s*%02X\r\n", text, sum);
-    return record;
+    return line_record(text, '*');
 }
 
 static void reads_what_the_board_is_configured_to_send(void **state)
