@@ -94,9 +94,9 @@ fuzz: | setup-tests ## fuzz the runtime's parsers: make fuzz [SECONDS=60], of ea
 	    $$fuzzer -max_total_time=$(or $(SECONDS),60) -max_len=1024 -verbosity=0 -artifact_prefix=$$found- $$found \
 	        $$(test ! -d $$known || echo $$known) 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
-bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=5]
+bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
 	$(Q)images/install-host-packages runtime/bench/packages.txt
-	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS))
+	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ROUNDS),--rounds $(ROUNDS))
 
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck
