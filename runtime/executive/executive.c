@@ -32,7 +32,8 @@ struct executive {
     const struct run_options *options;
     struct run_result *result;
     struct schedule *schedule;
-    struct watch *watch; /* NULL: nothing is printed */
+    struct watch *watch;   /* NULL: nothing is printed */
+    struct change *change; /* NULL: parameters stay as they are */
     int ended_fd;
     _Atomic bool stop, ended;
     _Atomic uint64_t heartbeat; /* steps done, for the watching thread */
@@ -173,6 +174,8 @@ static void *control(void *argument)
         atomic_store_explicit(&executive->heartbeat, result->steps, memory_order_release);
         if (failed)
             break;
+        if (executive->change)
+            change_take(executive->change, result->steps);
         if (result->steps == options->steps)
             end(result, ENDING_ASKED, NULL, "all steps are done");
         release_ns = next_release(executive, release_ns, now_ns, &in_a_row);
@@ -246,6 +249,14 @@ static void abandon(struct executive *executive)
     _exit(1);
 }
 
+static void serve_parameters(const struct executive *executive)
+{
+    int error = executive->options->tuner ? tuner_start(executive->options->tuner) : 0;
+    if (error)
+        fprintf(stderr, "flotilla: %s: no thread for parameters (%s): they stay as they are\n", executive->task->name,
+                strerror(error));
+}
+
 void executive_run(struct task *task, const struct run_options *options, struct run_result *result)
 {
     pthread_t thread;
@@ -256,6 +267,7 @@ void executive_run(struct task *task, const struct run_options *options, struct 
     if (options->watched_count)
         executive.watch = watch_create(options->watched, options->watched_count);
     executive.schedule = schedule_create(task);
+    executive.change = options->tuner ? tuner_change(options->tuner) : NULL;
     if (!options->no_wait)
         privilege_lock_memory();
     int priority = options->no_wait ? 0 : privilege_priority(task->priority);
@@ -267,12 +279,15 @@ void executive_run(struct task *task, const struct run_options *options, struct 
         if (error) {
             end(result, ENDING_FAILED, NULL, strerror(error));
         } else {
+            serve_parameters(&executive);
             sd_notify(0, "READY=1");
             supervise(&executive, signals_fd);
             if (!atomic_load(&executive.ended))
                 abandon(&executive);
             sd_notify(0, "STOPPING=1");
             pthread_join(thread, NULL);
+            if (options->tuner)
+                tuner_stop(options->tuner);
             if (executive.watch)
                 watch_print(executive.watch);
         }
