@@ -87,7 +87,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime
+.PHONY: runtime check-runtime fuzz bench-runtime param
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -115,9 +115,12 @@ fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFu
 	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(or $(SECONDS),60) -max_len=1024 -timeout=10 -verbosity=0 \
 	        -artifact_prefix=$$found- $$found $$known 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
-bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=5]
+bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
 	$(Q)images/install-host-packages runtime/bench/packages.txt
-	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS))
+	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ROUNDS),--rounds $(ROUNDS))
+
+param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
+	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))
 
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck

@@ -174,24 +174,24 @@ def test_a_robot_that_dies_stops_the_roll_out_and_nothing_is_half_done(guests: G
     ) as run:  # fmt: skip
         assert run.stdout
         for line in run.stdout:
-            if line.startswith("changed: [robot2]"):
-                guests.machines["robot2"].cut()
+            if line.startswith("changed: [robot3]"):
+                guests.machines["robot3"].cut()
     assert run.returncode != 0
     report = json.loads((REPORTS / "fleet.json").read_text())
     assert {name: robot["outcome"] for name, robot in report["robots"].items()} == {
         "robot1": "changed",
-        "robot2": "unreachable",
+        "robot3": "unreachable",
     }
-    machine = guests.machines["robot2"]
+    machine = guests.machines["robot3"]
     machine.on()
-    machine.console.expect("robot2 login: ", BOOT_SECONDS)
-    guests.shells["robot2"].connect()
+    machine.console.expect("robot3 login: ", BOOT_SECONDS)
+    guests.shells["robot3"].connect()
     completed = guests.play(*AT_ONCE)
     assert completed.status == 0, completed.said
-    assert completed.outcomes() | {"robot2": ""} == {
+    assert completed.outcomes() | {"robot3": ""} == {
         "robot1": "up to date",
-        "robot2": "",
-        "robot3": "changed",
+        "robot2": "changed",
+        "robot3": "",
         "robot4": "changed",
     }
     for name in guests.robots:

@@ -64,6 +64,13 @@ def _hwcheck(arguments: argparse.Namespace) -> None:
     print(hwcheck.check(inventory.robot(inventory.load_fleet(), arguments.robot), arguments.seconds))
 
 
+def _param(arguments: argparse.Namespace) -> None:
+    from images.builder import inventory, param
+
+    robot = inventory.robot(inventory.load_fleet(), arguments.robot)
+    print(param.param(robot, arguments.task, arguments.parameter, arguments.value))
+
+
 def _bench(arguments: argparse.Namespace) -> None:
     from images.builder import bench, inventory
 
@@ -107,6 +114,7 @@ _COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
     "size": (_size, "what takes the room of an image"),
     "verify": (_verify, "build a second time under other circumstances and compare"),
     "hwcheck": (_hwcheck, "what a robot's hardware is and does"),
+    "param": (_param, "parameters of a control task that runs"),
     "bench": (_bench, "wall times and ratios against other builders"),
     "kernel": (_kernel, "build a kernel of our own as a Debian package"),
     "rotate-key": (_rotate_key, "give a robot a new host key"),
@@ -119,13 +127,16 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m images.builder", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
-    for name in ("image", "flash", "boot", "ssh", "size", "verify", "hwcheck", "bench", "rotate-key"):
+    for name in ("image", "flash", "boot", "ssh", "size", "verify", "hwcheck", "param", "bench", "rotate-key"):
         made[name].add_argument("--robot", type=int, help="number in the inventory")
     made["kernel"].add_argument("--board", required=True, help="name in kernel/kernels.yml")
     made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
     made["hwcheck"].add_argument(
         "--seconds", type=int, default=60, help="of looking for hardware latency (%(default)s)"
     )
+    made["param"].add_argument("task", help="which runs on the robot")
+    made["param"].add_argument("parameter", nargs="?", help="block.parameter; all by default")
+    made["param"].add_argument("value", nargs="?", help="what to set it to")
     made["verify"].add_argument("--plant", action="store_true", help="plant a difference, which must be found")
     made["rotate-key"].add_argument("--retire", action="store_true", help="accept the old one no more")
     target = made["flash"].add_mutually_exclusive_group(required=True)

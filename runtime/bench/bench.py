@@ -1,8 +1,10 @@
 """What a block costs: chains of gains in our executive and in LinuxCNC's HAL, in one run. `make bench-runtime`.
 
-Both call each function of a chain by a pointer, time it, and keep its extremes, in a thread at 1 kHz. What is compared
-is the processor time of whole processes as the kernel counts it (/proc/PID/task/TID/schedstat), divided by steps; a
-block costs what a longer chain adds to a step.
+Both call each function of a chain by a pointer, time it by the processor's time stamp counter, and keep its longest
+time, in a thread at 1 kHz; ours also adds the times up. What is compared is the processor time of whole processes as
+the kernel counts it (/proc/PID/task/TID/schedstat), divided by steps; a block costs what a longer chain adds to a step,
+by chains of the same lengths. Other load of the computer moves the figures: so both take turns, several times, and
+medians are printed with the least and the greatest.
 """
 
 from __future__ import annotations
@@ -15,16 +17,19 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 _NULL = subprocess.DEVNULL
 _PATIENCE_S = 60
-COUNTS = (10, 100, 1000)
+COUNTS = (10, 100, 400, 1000)
 HAL_COUNTS = (10, 100, 400)
 """Its shared memory has no room for a thousand."""
+SLOPE = (100, 400)
+"""Chains whose difference is what a block costs."""
 PERIOD_NS = 1_000_000
 IDLE_BLOCKS = 100
 """Of the task that shall leave a core idle."""
@@ -114,53 +119,66 @@ def _started(halrun: subprocess.Popen[bytes]) -> int:
     deadline = time.monotonic() + _PATIENCE_S
     while time.monotonic() < deadline and halrun.poll() is None:
         found = subprocess.run(["pgrep", "-n", "-x", "rtapi_app"], capture_output=True, text=True, check=False).stdout
-        if found and any(thread.name != found.strip() for thread in Path(f"/proc/{found.strip()}/task").iterdir()):
-            before_ns = processor_ns(int(found))
-            time.sleep(0.2)
-            if processor_ns(int(found)) > before_ns:
-                return int(found)
+        with suppress(FileNotFoundError):  # it was one that ended just now
+            if found and any(thread.name != found.strip() for thread in Path(f"/proc/{found.strip()}/task").iterdir()):
+                before_ns = processor_ns(int(found))
+                time.sleep(0.2)
+                if processor_ns(int(found)) > before_ns:
+                    return int(found)
         time.sleep(0.05)
     raise SystemExit(f"halrun has started no thread within {_PATIENCE_S} s")
 
 
-def slope_ns(costs: list[Cost]) -> float:
-    """What a further block adds to a step: between the two longest chains."""
-    shorter, longer = costs[-2:]
-    return (longer.step_ns - shorter.step_ns) / (longer.blocks - shorter.blocks)
+def slope_ns(costs: Mapping[int, Cost]) -> float:
+    """What a further block adds to a step, from one round's chains."""
+    shorter, longer = SLOPE
+    return (costs[longer].step_ns - costs[shorter].step_ns) / (longer - shorter)
 
 
 def measure(
     run: Callable[[int, Path], AbstractContextManager[int]], counts: Sequence[int], seconds: float
-) -> list[Cost]:
-    costs = []
+) -> dict[int, Cost]:
+    """One round: each chain once."""
+    costs = {}
     for blocks in counts:
         with tempfile.TemporaryDirectory() as directory, run(blocks, Path(directory)) as pid:
-            costs.append(observe(pid, blocks, seconds))
+            costs[blocks] = observe(pid, blocks, seconds)
     return costs
 
 
-def report(name: str, costs: list[Cost]) -> str:
-    rows = [
-        f"  {cost.blocks:5} blocks: {cost.step_ns / 1000:8.2f} us a step, {cost.busy_percent:5.2f} % of a processor, "
-        f"{cost.memory_kib} KiB"
-        for cost in costs
-    ]
-    return "\n".join([f"{name}: {slope_ns(costs):.1f} ns a block", *rows])
+def report(name: str, rounds: Sequence[Mapping[int, Cost]]) -> str:
+    slopes = [slope_ns(costs) for costs in rounds]
+    lines = [f"{name}: {median(slopes):.1f} ns a block ({min(slopes):.1f} to {max(slopes):.1f})"]
+    for blocks in rounds[0]:
+        steps_us = [costs[blocks].step_ns / 1000 for costs in rounds]
+        busy_percent = median(costs[blocks].busy_percent for costs in rounds)
+        lines.append(
+            f"  {blocks:5} blocks: {median(steps_us):8.2f} us a step ({min(steps_us):.2f} to {max(steps_us):.2f}), "
+            f"{busy_percent:5.2f} % of a processor, {rounds[0][blocks].memory_kib} KiB"
+        )
+    return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m runtime.bench.bench", description=__doc__)
     parser.add_argument("program", type=Path, help="flotilla-run")
-    parser.add_argument("--seconds", type=float, default=5, help="for each chain")
+    parser.add_argument("--seconds", type=float, default=2, help="for each chain (%(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each (%(default)s)")
     options = parser.parse_args()
-    ours = measure(functools.partial(flotilla, program=options.program), COUNTS, options.seconds)
-    print(report("flotilla-run", ours), flush=True)
-    if shutil.which("halcmd"):
-        theirs = measure(hal, HAL_COUNTS, options.seconds)
+    compared = shutil.which("halcmd") is not None
+    ours, theirs = [], []
+    for _ in range(options.rounds):
+        ours.append(measure(functools.partial(flotilla, program=options.program), COUNTS, options.seconds))
+        if compared:
+            theirs.append(measure(hal, HAL_COUNTS, options.seconds))
+    print(f"medians of {options.rounds} rounds of {options.seconds:g} s (least to greatest)")
+    print(report("flotilla-run", ours))
+    if compared:
         print(report("LinuxCNC HAL", theirs))
-        print(f"ratio: {slope_ns(ours) / slope_ns(theirs):.2f} a block")
-    idle = next(cost for cost in ours if cost.blocks == IDLE_BLOCKS)
-    print(f"a task of {IDLE_BLOCKS} blocks at 1 kHz leaves {100 - idle.busy_percent:.1f} % of a processor idle")
+        ratio = median(map(slope_ns, ours)) / median(map(slope_ns, theirs))
+        print(f"ratio: {ratio:.2f} a block")
+    idle_percent = 100 - median(costs[IDLE_BLOCKS].busy_percent for costs in ours)
+    print(f"a task of {IDLE_BLOCKS} blocks at 1 kHz leaves {idle_percent:.1f} % of a processor idle")
 
 
 if __name__ == "__main__":

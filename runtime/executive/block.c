@@ -45,7 +45,7 @@ int64_t fl_now_ns(void)
     return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
 }
 
-enum { LINE = 64 }; /* bytes of a cache line: rings keep their two ends on lines of their own */
+enum { LINE = BLOCK_LINE }; /* rings keep their two ends on cache lines of their own */
 
 void *fl_allocate(struct fl_block *block, size_t bytes)
 {
@@ -106,17 +106,36 @@ int fl_add_output(struct fl_block *block, struct fl_port port)
     return result;
 }
 
+/* A block and its small pieces: parameters, wires, scalar signals. Side by side, because what a step touches has left
+ * the cache by the next one. */
+struct placed {
+    struct fl_block block;
+    _Alignas(LINE) unsigned char near[BLOCK_NEAR];
+};
+
+static void *place(struct fl_block *block, size_t bytes)
+{
+    struct fl_service *service = block->service;
+    size_t rounded = (bytes + 7) & ~(size_t)7; /* no piece has a type that needs more */
+    if (rounded > BLOCK_NEAR - service->near_used)
+        return fl_allocate(block, bytes);
+    void *piece = ((struct placed *)block)->near + service->near_used;
+    service->near_used += rounded;
+    return piece;
+}
+
 struct fl_block *block_create(const struct fl_block_type *type, const char *name)
 {
-    struct fl_block *block = calloc(1, sizeof *block);
+    struct fl_block *block = aligned_alloc(LINE, sizeof(struct placed));
     struct fl_service *service = calloc(1, sizeof *service);
     char *copy = strdup(name);
     if (!block || !service || !copy)
         abort();
+    memset(block, 0, sizeof(struct placed));
     block->type = type;
     block->name = copy;
     block->service = service;
-    block->parameters = fl_allocate(block, type->parameters_size + 1);
+    block->parameters = place(block, type->parameters_size + 1);
     block->state = fl_allocate(block, type->state_size + 1);
     int failed = 0;
     for (uint32_t i = 0; i < type->input_count; i++)
@@ -130,16 +149,16 @@ struct fl_block *block_create(const struct fl_block_type *type, const char *name
 
 int block_make_signals(struct fl_block *block)
 {
-    void **out = fl_allocate(block, sizeof(void *) * (block->out_count + 1));
-    const void **in = fl_allocate(block, sizeof(void *) * (block->in_count + 1));
+    void **out = place(block, sizeof(void *) * (block->out_count + 1));
+    const void **in = place(block, sizeof(void *) * (block->in_count + 1));
     if (!out || !in)
         return FL_FAILED;
     for (uint32_t i = 0; i < block->out_count; i++)
-        if (!(out[i] = fl_allocate(block, fl_type_size(block->out_ports[i].type) * block->out_ports[i].width)))
+        if (!(out[i] = place(block, fl_type_size(block->out_ports[i].type) * block->out_ports[i].width)))
             return FL_FAILED;
     /* What stays without a wire reads zero. */
     for (uint32_t i = 0; i < block->in_count; i++)
-        if (!(in[i] = fl_allocate(block, fl_type_size(block->in_ports[i].type) * block->in_ports[i].width)))
+        if (!(in[i] = place(block, fl_type_size(block->in_ports[i].type) * block->in_ports[i].width)))
             return FL_FAILED;
     block->out = out;
     block->in = in;

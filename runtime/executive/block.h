@@ -6,6 +6,21 @@
 
 #include <flotilla/block.h>
 
+#if defined(__SANITIZE_ADDRESS__)
+#define BLOCK_ALONE 1
+#elif defined(__has_feature)
+#define BLOCK_ALONE __has_feature(address_sanitizer)
+#else
+#define BLOCK_ALONE 0
+#endif
+
+enum {
+    BLOCK_LINE = 64,                               /* bytes of a cache line */
+    BLOCK_NEAR = BLOCK_ALONE ? 0 : 2 * BLOCK_LINE, /* beside a block, for its small pieces; AddressSanitizer only sees a
+                                                    * write beyond a piece that lies alone */
+    BLOCK_TOUCHED = 3 * BLOCK_LINE,                /* the block, and most often all of its pieces */
+};
+
 /* With the ports of the type's tables; parameters and state are zero. Not there yet: signals. */
 struct fl_block *block_create(const struct fl_block_type *type, const char *name);
 
@@ -14,6 +29,13 @@ int block_make_signals(struct fl_block *block);
 
 /* Let an input read what `signal` points at. */
 void block_wire(struct fl_block *block, uint32_t port, const void *signal);
+
+/* Bring what a step of it touches to the cache. NULL is allowed. */
+static inline void block_prefetch(const struct fl_block *block)
+{
+    for (size_t at = 0; at < BLOCK_TOUCHED; at += BLOCK_LINE)
+        __builtin_prefetch((const char *)block + at);
+}
 
 /* Free it and all it allocated; after terminate. */
 void block_destroy(struct fl_block *block);

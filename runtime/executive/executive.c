@@ -3,6 +3,7 @@
 
 #include "block.h"
 #include "privilege.h"
+#include "schedule.h"
 #include "watch.h"
 
 #include <errno.h>
@@ -30,7 +31,9 @@ struct executive {
     struct task *task;
     const struct run_options *options;
     struct run_result *result;
-    struct watch *watch; /* NULL: nothing is printed */
+    struct schedule *schedule;
+    struct watch *watch;   /* NULL: nothing is printed */
+    struct change *change; /* NULL: parameters stay as they are */
     int ended_fd;
     _Atomic bool stop, ended;
     _Atomic uint64_t heartbeat; /* steps done, for the watching thread */
@@ -119,32 +122,6 @@ static void sleep_until(int64_t release_ns)
         continue;
 }
 
-/* One step of the task; false when a block failed. The end of a block's step is the begin of the next one's. */
-static bool step_blocks(struct executive *executive, int64_t release_ns, int64_t *now_ns)
-{
-    struct task *task = executive->task;
-    for (size_t i = 0; i < task->count; i++) {
-        struct member *member = &task->members[i];
-        struct fl_block *block = member->block;
-        if (member->until) {
-            member->until--;
-            continue;
-        }
-        member->until = (uint32_t)member->every - 1;
-        block->release_ns = release_ns;
-        int failed = block->type->step(block);
-        block->step++;
-        int64_t after_ns = fl_now_ns();
-        statistics_add(&member->time, after_ns - *now_ns);
-        *now_ns = after_ns;
-        if (failed) {
-            end(executive->result, ENDING_FAILED, block, block->service->failure);
-            return false;
-        }
-    }
-    return true;
-}
-
 /* When the step after one that was released at `release_ns` and ended at `now_ns` is due. */
 static int64_t next_release(struct executive *executive, int64_t release_ns, int64_t now_ns, int64_t *in_a_row)
 {
@@ -183,17 +160,22 @@ static void *control(void *argument)
     while (!atomic_load_explicit(&executive->stop, memory_order_relaxed)) {
         if (!options->no_wait)
             sleep_until(release_ns);
-        int64_t begin_ns = fl_now_ns(), now_ns = begin_ns;
+        int64_t begin_ns = fl_now_ns();
         if (!options->no_wait)
             statistics_add(&result->jitter, begin_ns - release_ns);
-        bool good = step_blocks(executive, release_ns, &now_ns);
+        const struct fl_block *failed = schedule_step(executive->schedule, release_ns);
+        int64_t now_ns = fl_now_ns();
         statistics_add(&result->step, now_ns - begin_ns);
-        if (executive->watch && good)
+        if (failed)
+            end(result, ENDING_FAILED, failed, failed->service->failure);
+        else if (executive->watch)
             watch_put(executive->watch, result->steps, release_ns, options->no_wait);
         result->steps++;
         atomic_store_explicit(&executive->heartbeat, result->steps, memory_order_release);
-        if (!good)
+        if (failed)
             break;
+        if (executive->change)
+            change_take(executive->change, result->steps);
         if (result->steps == options->steps)
             end(result, ENDING_ASKED, NULL, "all steps are done");
         release_ns = next_release(executive, release_ns, now_ns, &in_a_row);
@@ -267,6 +249,14 @@ static void abandon(struct executive *executive)
     _exit(1);
 }
 
+static void serve_parameters(const struct executive *executive)
+{
+    int error = executive->options->tuner ? tuner_start(executive->options->tuner) : 0;
+    if (error)
+        fprintf(stderr, "flotilla: %s: no thread for parameters (%s): they stay as they are\n", executive->task->name,
+                strerror(error));
+}
+
 void executive_run(struct task *task, const struct run_options *options, struct run_result *result)
 {
     pthread_t thread;
@@ -276,8 +266,8 @@ void executive_run(struct task *task, const struct run_options *options, struct 
     executive.ended_fd = eventfd(0, EFD_CLOEXEC);
     if (options->watched_count)
         executive.watch = watch_create(options->watched, options->watched_count);
-    for (size_t i = 0; i < task->count; i++)
-        task->members[i].until = (uint32_t)task->members[i].offset;
+    executive.schedule = schedule_create(task);
+    executive.change = options->tuner ? tuner_change(options->tuner) : NULL;
     if (!options->no_wait)
         privilege_lock_memory();
     int priority = options->no_wait ? 0 : privilege_priority(task->priority);
@@ -289,18 +279,23 @@ void executive_run(struct task *task, const struct run_options *options, struct 
         if (error) {
             end(result, ENDING_FAILED, NULL, strerror(error));
         } else {
+            serve_parameters(&executive);
             sd_notify(0, "READY=1");
             supervise(&executive, signals_fd);
             if (!atomic_load(&executive.ended))
                 abandon(&executive);
             sd_notify(0, "STOPPING=1");
             pthread_join(thread, NULL);
+            if (options->tuner)
+                tuner_stop(options->tuner);
             if (executive.watch)
                 watch_print(executive.watch);
         }
     }
     end(result, ENDING_ASKED, NULL, "a signal asked for it");
     terminate_blocks(task);
+    schedule_report(executive.schedule, task);
+    schedule_destroy(executive.schedule);
     watch_destroy(executive.watch);
     close(executive.ended_fd);
     close(signals_fd);
@@ -317,8 +312,9 @@ void executive_write_statistics(const struct task *task, const struct run_result
     statistics_write(&result->step, out);
     fprintf(out, ",\n \"blocks\": {");
     for (size_t i = 0; i < task->count; i++) {
-        fprintf(out, "%s\n  \"%s\": ", i ? "," : "", task->members[i].block->name);
-        statistics_write(&task->members[i].time, out);
+        const struct member *member = &task->members[i];
+        fprintf(out, "%s\n  \"%s\": {\"count\": %" PRIu64 ", \"mean_ns\": %" PRId64 ", \"max_ns\": %" PRId64 "}",
+                i ? "," : "", member->block->name, member->took.count, member->took.mean_ns, member->took.max_ns);
     }
     fprintf(out, "}}\n");
 }

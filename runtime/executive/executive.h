@@ -9,6 +9,7 @@
 
 #include "statistics.h"
 #include "task.h"
+#include "tuner.h"
 
 #include <stdbool.h>
 #include <stdio.h>
@@ -33,6 +34,7 @@ struct run_options {
     bool no_wait;                  /* do not wait for a release: time is counted, not measured */
     const struct watched *watched; /* print them each step as a line of JSON on stdout */
     size_t watched_count;
+    struct tuner *tuner; /* serves while the task runs; NULL: parameters stay as they are */
 };
 
 struct run_result {

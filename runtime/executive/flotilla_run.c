@@ -6,6 +6,7 @@
 #include <errno.h>
 #include <getopt.h>
 #include <inttypes.h>
+#include <limits.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -20,13 +21,15 @@ static const char usage[] =
     "  --no-wait           do not wait for releases: time is counted, not measured\n"
     "  --watch SIGNALS     print block.port,block.port[2],... each step, a line of JSON each\n"
     "  --statistics FILE   write times, jitter and overruns as JSON at the end\n"
+    "  --control PATH      socket at which flotilla-param reads and sets parameters\n"
+    "                      (default: control in $RUNTIME_DIRECTORY, as a service has one; otherwise none)\n"
     "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS ")\n"
     "  --help, --version\n"
     "\n"
     "Status: 0 ended as asked, 1 the task failed (outputs are in their reset state), 2 the command line or the task\n"
     "file is wrong, 3 it runs already.\n";
 
-enum { CHECK = 1, DOT, SAFE, STEPS, NO_WAIT, WATCH, STATISTICS, BLOCKS, HELP, VERSION };
+enum { CHECK = 1, DOT, SAFE, STEPS, NO_WAIT, WATCH, STATISTICS, CONTROL, BLOCKS, HELP, VERSION };
 
 static const struct option options[] = {
     {"check", no_argument, NULL, CHECK},
@@ -36,6 +39,7 @@ static const struct option options[] = {
     {"no-wait", no_argument, NULL, NO_WAIT},
     {"watch", required_argument, NULL, WATCH},
     {"blocks", required_argument, NULL, BLOCKS},
+    {"control", required_argument, NULL, CONTROL},
     {"statistics", required_argument, NULL, STATISTICS},
     {"help", no_argument, NULL, HELP},
     {"version", no_argument, NULL, VERSION},
@@ -44,7 +48,7 @@ static const struct option options[] = {
 
 struct command {
     int mode; /* CHECK, DOT, SAFE, or 0: run */
-    const char *path, *blocks, *statistics;
+    const char *path, *blocks, *statistics, *control;
     char *watch;
     struct run_options run;
 };
@@ -74,6 +78,9 @@ static bool parse(struct command *command, int argc, char **argv)
             break;
         case STATISTICS:
             command->statistics = optarg;
+            break;
+        case CONTROL:
+            command->control = optarg;
             break;
         case BLOCKS:
             command->blocks = optarg;
@@ -132,6 +139,18 @@ static bool write_statistics(const char *path, const struct task *task, const st
     return true;
 }
 
+/* False when it was asked for and cannot be. A service controls its robot all the same. */
+static bool open_control(struct command *command, struct task *task)
+{
+    char path[PATH_MAX];
+    const char *directory = getenv("RUNTIME_DIRECTORY");
+    if (!command->control && !directory)
+        return true;
+    snprintf(path, sizeof path, "%s/control", directory ? directory : "");
+    command->run.tuner = tuner_create(command->control ? command->control : path, task);
+    return command->run.tuner || !command->control;
+}
+
 static int run(struct command *command, struct task *task)
 {
     struct run_result result;
@@ -142,7 +161,10 @@ static int run(struct command *command, struct task *task)
         fprintf(stderr, "flotilla-run: %s: %s\n", command->path, strerror(errno));
     if (holder)
         return 3;
+    if (!open_control(command, task))
+        return 2;
     executive_run(task, &command->run, &result);
+    tuner_destroy(command->run.tuner);
     bool written = !command->statistics || write_statistics(command->statistics, task, &result);
     if (result.ending != ENDING_ASKED)
         fprintf(stderr, "flotilla: %s: %s; outputs are in their reset state\n", task->name, result.reason);

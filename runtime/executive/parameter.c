@@ -162,7 +162,7 @@ static bool read_kind(struct fl_block *block, const struct fl_parameter *paramet
     return false;
 }
 
-static size_t kind_size(enum fl_kind kind)
+size_t parameter_size(enum fl_kind kind)
 {
     static const size_t sizes[] = {
         [FL_KIND_BOOLEAN] = sizeof(bool),
@@ -204,7 +204,7 @@ bool parameter_set(struct fl_block *block, const struct fl_parameter *parameter,
                  parameter->unit ? " " : "", parameter->unit ? parameter->unit : "");
         return false;
     }
-    memcpy((char *)parameters + parameter->offset, &place, kind_size(parameter->kind));
+    memcpy((char *)parameters + parameter->offset, &place, parameter_size(parameter->kind));
     return true;
 }
 
@@ -216,14 +216,82 @@ static const struct fl_parameter *parameter_named(const struct fl_block_type *ty
     return NULL;
 }
 
-static void list_names(const struct fl_block_type *type, char *out, size_t size)
+const struct fl_parameter *parameter_find(const struct fl_block_type *type, const char *name, char *reason,
+                                          size_t reason_size)
 {
-    size_t used = 0;
-    out[0] = '\0';
-    for (uint32_t i = 0; i < type->parameter_count && used < size; i++)
-        used += (size_t)snprintf(out + used, size - used, "%s%s", i ? ", " : "", type->parameters[i].name);
-    if (!type->parameter_count)
-        snprintf(out, size, "none");
+    const struct fl_parameter *parameter = parameter_named(type, name);
+    if (parameter)
+        return parameter;
+    int used = snprintf(reason, reason_size, "%s has no parameter %s; it has ", type->name, name);
+    for (uint32_t i = 0; i < type->parameter_count && used >= 0 && (size_t)used < reason_size; i++)
+        used += snprintf(reason + used, reason_size - (size_t)used, "%s%s", i ? ", " : "", type->parameters[i].name);
+    if (!type->parameter_count && (size_t)used < reason_size)
+        snprintf(reason + used, reason_size - (size_t)used, "none");
+    return NULL;
+}
+
+/* The shortest text that is read as the same number. */
+static void write_real(double value, FILE *out)
+{
+    char text[32];
+    for (int digits = 15; digits <= 17; digits++) {
+        snprintf(text, sizeof text, "%.*g", digits, value);
+        if (memcmp(&(double){strtod(text, NULL)}, &value, sizeof value) == 0)
+            break;
+    }
+    fputs(text, out);
+}
+
+static void write_text(const char *text, FILE *out)
+{
+    fputc('"', out);
+    for (; *text; text++)
+        fputc(iscntrl((unsigned char)*text) ? ' ' : *text, out); /* a line stays a line */
+    fputc('"', out);
+}
+
+void parameter_write(const struct fl_parameter *parameter, const void *parameters, FILE *out)
+{
+    const void *place = (const char *)parameters + parameter->offset;
+    const struct fl_reals *reals = place;
+    const struct fl_texts *texts = place;
+    const char *choices = parameter->choices;
+    switch (parameter->kind) {
+    case FL_KIND_BOOLEAN:
+        fputs(*(const bool *)place ? "true" : "false", out);
+        break;
+    case FL_KIND_INTEGER:
+        fprintf(out, "%" PRId64, *(const int64_t *)place);
+        break;
+    case FL_KIND_REAL:
+        write_real(*(const double *)place, out);
+        break;
+    case FL_KIND_TEXT:
+        write_text(*(const char *const *)place, out);
+        break;
+    case FL_KIND_DEVICE:
+        write_text(((const struct fl_device *)place)->path, out);
+        break;
+    case FL_KIND_CHOICE:
+        for (int before = *(const int *)place; before > 0; before--)
+            choices += strcspn(choices, "|") + 1;
+        fprintf(out, "%.*s", (int)strcspn(choices, "|"), choices);
+        break;
+    case FL_KIND_REALS:
+        for (size_t i = 0; i < reals->count; i++) {
+            fputs(i ? ", " : "[", out);
+            write_real(reals->value[i], out);
+        }
+        fputs(reals->count ? "]" : "[]", out);
+        break;
+    case FL_KIND_TEXTS:
+        for (size_t i = 0; i < texts->count; i++) {
+            fputs(i ? ", " : "[", out);
+            write_text(texts->value[i], out);
+        }
+        fputs(texts->count ? "]" : "[]", out);
+        break;
+    }
 }
 
 void parameters_set(struct fl_block *block, const struct written *written, size_t count, unsigned line,
@@ -251,11 +319,7 @@ void parameters_set(struct fl_block *block, const struct written *written, size_
             problem(problems, value ? value->line : line, "block %s: parameter %s: %s", block->name, parameter->name,
                     reason);
     }
-    for (size_t w = 0; w < count; w++) {
-        if (!parameter_named(type, written[w].name)) {
-            list_names(type, reason, sizeof reason);
-            problem(problems, written[w].line, "block %s: %s has no parameter %s; it has %s", block->name, type->name,
-                    written[w].name, reason);
-        }
-    }
+    for (size_t w = 0; w < count; w++)
+        if (!parameter_find(type, written[w].name, reason, sizeof reason))
+            problem(problems, written[w].line, "block %s: %s", block->name, reason);
 }

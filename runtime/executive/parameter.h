@@ -20,6 +20,16 @@ struct written {
 bool parameter_set(struct fl_block *block, const struct fl_parameter *parameter, void *parameters,
                    const struct written *value, char *reason, size_t reason_size);
 
+/* The parameter of that name; NULL with what there is in `reason`. */
+const struct fl_parameter *parameter_find(const struct fl_block_type *type, const char *name, char *reason,
+                                          size_t reason_size);
+
+/* Its value in the structure `parameters`, as a task file writes it. */
+void parameter_write(const struct fl_parameter *parameter, const void *parameters, FILE *out);
+
+/* Bytes of a value of that kind in a structure of parameters. */
+size_t parameter_size(enum fl_kind kind);
+
 /* All of them: what is written, and the fallbacks of what is not. */
 void parameters_set(struct fl_block *block, const struct written *written, size_t count, unsigned line,
                     struct problems *problems);

@@ -16,6 +16,7 @@ struct fl_service {
     char failure[FL_FAILURE_BYTES];
     int priority; /* SCHED_FIFO of the block's threads; 0: ordinary */
     struct fl_port *in_ports, *out_ports;
+    size_t near_used; /* of the bytes beside the block */
 };
 
 /* Start a thread named after the block, at the service's priority where that is allowed; 0 or an errno. */

@@ -3,14 +3,17 @@
 #define FLOTILLA_TASK_H
 
 #include "registry.h"
-#include "statistics.h"
 #include "task_file.h"
+
+struct took {
+    uint64_t count; /* of steps */
+    int64_t mean_ns, max_ns;
+};
 
 struct member {
     struct fl_block *block;
     int64_t every, offset;
-    struct statistics time; /* of its steps */
-    uint32_t until;         /* steps of the task until its next */
+    struct took took; /* by its steps, after a run */
     bool started;
     bool incomplete; /* its ports are not known, because its parameters are wrong */
 };

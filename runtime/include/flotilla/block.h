@@ -90,7 +90,9 @@ enum fl_kind {
 };
 
 enum {
-    FL_TUNABLE = 1u << 0, /* may be set while the task runs, between two steps; not for texts and lists */
+    /* may be set while the task runs, between two steps: `step` reads it where it uses it. Not for texts and lists, and
+     * not for what start, initialize or a driver's thread reads. */
+    FL_TUNABLE = 1u << 0,
 };
 
 struct fl_parameter {

@@ -1,0 +1,31 @@
+"""`make param`: parameters of a control task that runs on a robot, read and set by its own `flotilla-param`."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+
+from images.builder import boot
+from images.builder.errors import UserError
+from images.builder.fleet import Robot
+
+_SSH_FAILED = 255
+"""Status of `ssh` when there is no connection; every other one is the command's."""
+
+
+def param(robot: Robot, task: str, parameter: str | None = None, value: str | None = None) -> str:
+    """All parameters of the task, a line each; one's value; or what it was and is, and since which step.
+
+    UserError with the robot's reason, or when it does not answer.
+    """
+    words = ["flotilla-param", task, *([parameter] if parameter else []), *([value] if value is not None else [])]
+    argv = [*boot.ssh_command(robot), shlex.join(words)]
+    done = subprocess.run(argv, capture_output=True, encoding="utf-8", check=False)
+    if done.returncode == _SSH_FAILED:
+        raise UserError(
+            f"{robot.name} did not answer: {done.stderr.strip()}; "
+            f"is it on and reachable? `make ssh ROBOT={robot.number}`"
+        )
+    if done.returncode:
+        raise UserError(f"{robot.name}: {done.stderr.strip().removeprefix('flotilla-param: ')}")
+    return done.stdout.rstrip("\n")

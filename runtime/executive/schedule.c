@@ -1,0 +1,112 @@
+#include "schedule.h"
+
+#include "block.h"
+#include "ticks.h"
+
+#include <math.h>
+#include <stdlib.h>
+
+enum { AHEAD = 4 }; /* blocks: a line comes from memory in the time that those take */
+
+/* A block's step, and the ticks that it took; how often is counted in the block. */
+struct call {
+    int (*step)(struct fl_block *block);
+    struct fl_block *block;
+    int64_t sum, max;
+};
+
+/* Calls that follow each other and have the same turns: most often all of a task. */
+struct turn {
+    uint32_t count, every;
+    uint32_t until; /* steps of the task until its next */
+};
+
+struct schedule {
+    struct call *calls;
+    struct turn *turns;
+    size_t count, turn_count;
+    bool counter;
+    struct moment begin;
+};
+
+static void *made(size_t bytes)
+{
+    void *memory = calloc(1, bytes);
+    if (!memory)
+        abort();
+    return memory;
+}
+
+struct schedule *schedule_create(const struct task *task)
+{
+    struct schedule *schedule = made(sizeof *schedule);
+    schedule->calls = made(sizeof *schedule->calls * (task->count + AHEAD));
+    schedule->turns = made(sizeof *schedule->turns * (task->count + 1));
+    schedule->count = task->count;
+    for (size_t i = 0; i < task->count; i++) {
+        const struct member *member = &task->members[i];
+        schedule->calls[i] = (struct call){.step = member->block->type->step, .block = member->block};
+        if (!i || member->every != member[-1].every || member->offset != member[-1].offset)
+            schedule->turns[schedule->turn_count++] =
+                (struct turn){.every = (uint32_t)member->every, .until = (uint32_t)member->offset};
+        schedule->turns[schedule->turn_count - 1].count++;
+    }
+    schedule->counter = ticks_constant();
+    schedule->begin = ticks_moment(schedule->counter);
+    return schedule;
+}
+
+void schedule_destroy(struct schedule *schedule)
+{
+    if (!schedule)
+        return;
+    free(schedule->calls);
+    free(schedule->turns);
+    free(schedule);
+}
+
+/* The end of a block's step is the begin of the next one's. */
+const struct fl_block *schedule_step(struct schedule *schedule, int64_t release_ns)
+{
+    const bool counter = schedule->counter;
+    struct call *call = schedule->calls;
+    int64_t before = ticks_now(counter);
+    for (struct turn *turn = schedule->turns, *last = turn + schedule->turn_count; turn < last; turn++) {
+        struct call *end = call + turn->count;
+        if (turn->until) {
+            turn->until--;
+            call = end;
+            continue;
+        }
+        turn->until = turn->every - 1;
+        for (; call < end; call++) {
+            struct fl_block *block = call->block;
+            block_prefetch(call[AHEAD].block);
+            block->release_ns = release_ns;
+            int failed = call->step(block);
+            block->step++;
+            int64_t after = ticks_now(counter), took = after - before;
+            before = after;
+            call->sum += took;
+            if (took > call->max)
+                call->max = took;
+            if (failed)
+                return block;
+        }
+    }
+    return NULL;
+}
+
+void schedule_report(const struct schedule *schedule, struct task *task)
+{
+    double unit_ns = ticks_ns(schedule->begin, ticks_moment(schedule->counter));
+    for (size_t i = 0; i < schedule->count; i++) {
+        const struct call *call = &schedule->calls[i];
+        uint64_t count = call->block->step;
+        task->members[i].took = (struct took){
+            .count = count,
+            .mean_ns = llround(count ? unit_ns * (double)call->sum / (double)count : 0),
+            .max_ns = llround(unit_ns * (double)call->max),
+        };
+    }
+}

@@ -1,0 +1,407 @@
+#define _GNU_SOURCE
+#include "tuner.h"
+
+#include "block.h"
+
+#include <errno.h>
+#include <inttypes.h>
+#include <poll.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+enum {
+    REQUEST_BYTES = 512,
+    REASON_BYTES = 512,
+    CLIENT_MS = 2000, /* for its request to come, and for the answer to leave */
+    QUEUED = 16,      /* connections that wait for their turn */
+    FOR_EVER = -1,
+};
+
+#define MILLISECOND_NS INT64_C(1000000)
+
+struct tuner {
+    struct change change;
+    struct task *task;
+    char *path;
+    int listen_fd, stop_fd;
+    bool started;
+    pthread_t thread;
+};
+
+struct client {
+    int fd;
+    uid_t user;
+    char request[REQUEST_BYTES];
+    char reason[REASON_BYTES]; /* why it was not done */
+    FILE *answer;
+};
+
+static bool refuse(struct client *client, const char *format, ...) __attribute__((format(printf, 2, 3)));
+static bool refuse(struct client *client, const char *format, ...)
+{
+    va_list arguments;
+    va_start(arguments, format);
+    vsnprintf(client->reason, sizeof client->reason, format, arguments);
+    va_end(arguments);
+    return false;
+}
+
+/* --- waiting: for the end of the task, too --- */
+
+static int64_t deadline_in(int64_t milliseconds)
+{
+    return fl_now_ns() + milliseconds * MILLISECOND_NS;
+}
+
+/* Until any of `waiting` from the second on is ready; the first is the tuner's. False at the deadline (FOR_EVER: none)
+ * and when the task ends. */
+static bool await(const struct tuner *tuner, struct pollfd *waiting, nfds_t count, int64_t deadline_ns)
+{
+    waiting[0] = (struct pollfd){.fd = tuner->stop_fd, .events = POLLIN};
+    for (;;) {
+        int64_t left_ms = (deadline_ns - fl_now_ns() + MILLISECOND_NS - 1) / MILLISECOND_NS;
+        int timeout_ms = deadline_ns == FOR_EVER ? -1
+                                                 : (int)(left_ms < 0           ? 0
+                                                         : left_ms < INT32_MAX ? left_ms
+                                                                               : INT32_MAX);
+        int ready = poll(waiting, count, timeout_ms);
+        if (ready >= 0 || errno != EINTR)
+            return ready > 0 && !waiting[0].revents;
+    }
+}
+
+/* --- what is asked --- */
+
+static struct fl_block *find_block(const struct tuner *tuner, struct client *client, const char *name)
+{
+    const struct task *task = tuner->task;
+    for (size_t i = 0; i < task->count; i++)
+        if (strcmp(task->members[i].block->name, name) == 0)
+            return task->members[i].block;
+    refuse(client, "the task has no block %s; it has ", name);
+    for (size_t i = 0; i < task->count; i++) {
+        size_t used = strlen(client->reason);
+        snprintf(client->reason + used, sizeof client->reason - used, "%s%s", i ? ", " : "",
+                 task->members[i].block->name);
+    }
+    return NULL;
+}
+
+/* "block.parameter"; NULL with the reason. */
+static const struct fl_parameter *find(const struct tuner *tuner, struct client *client, char *name,
+                                       struct fl_block **block)
+{
+    char reason[REASON_BYTES / 2];
+    char *dot = strchr(name, '.');
+    if (!dot) {
+        refuse(client, "%s is not BLOCK.PARAMETER", *name ? name : "nothing");
+        return NULL;
+    }
+    *dot = '\0';
+    *block = find_block(tuner, client, name);
+    const struct fl_parameter *parameter =
+        *block ? parameter_find((*block)->type, dot + 1, reason, sizeof reason) : NULL;
+    if (*block && !parameter)
+        refuse(client, "block %s: %s", name, reason);
+    return parameter;
+}
+
+/* The control thread copies what is small and owns nothing. */
+static bool tunable(const struct fl_parameter *parameter)
+{
+    enum fl_kind kind = parameter->kind;
+    bool plain = kind == FL_KIND_BOOLEAN || kind == FL_KIND_INTEGER || kind == FL_KIND_REAL || kind == FL_KIND_CHOICE;
+    return plain && parameter->flags & FL_TUNABLE;
+}
+
+static bool list(const struct tuner *tuner, struct client *client)
+{
+    for (size_t i = 0; i < tuner->task->count; i++) {
+        const struct fl_block *block = tuner->task->members[i].block;
+        for (uint32_t p = 0; p < block->type->parameter_count; p++) {
+            const struct fl_parameter *parameter = &block->type->parameters[p];
+            bool unit = parameter->unit && *parameter->unit, limits = parameter->min != parameter->max;
+            fprintf(client->answer, "%s.%s: ", block->name, parameter->name);
+            parameter_write(parameter, block->parameters, client->answer);
+            fprintf(client->answer, "%s%s", unit ? " " : "", unit ? parameter->unit : "");
+            if (tunable(parameter))
+                fprintf(client->answer, ", tunable");
+            if (tunable(parameter) && limits)
+                fprintf(client->answer, ", %g to %g", parameter->min, parameter->max);
+            if (parameter->choices)
+                fprintf(client->answer, ", %s", parameter->choices);
+            fputc('\n', client->answer);
+        }
+    }
+    return true;
+}
+
+static bool get(const struct tuner *tuner, struct client *client, char *name)
+{
+    struct fl_block *block;
+    const struct fl_parameter *parameter = find(tuner, client, name, &block);
+    if (!parameter)
+        return false;
+    parameter_write(parameter, block->parameters, client->answer);
+    fputc('\n', client->answer);
+    return true;
+}
+
+/* Whether the task file could have said so, and the value that it means: on a block that is like this one, but never
+ * starts. */
+static bool judge(struct client *client, const struct fl_block *block, const struct fl_parameter *parameter,
+                  const char *text, void *value)
+{
+    char reason[REASON_BYTES / 2];
+    const struct fl_block_type *type = block->type;
+    struct fl_block *like = block_create(type, block->name);
+    void *parameters = (void *)(uintptr_t)like->parameters;
+    memcpy(parameters, block->parameters, type->parameters_size);
+    like->period_ns = block->period_ns;
+    bool good =
+        parameter_set(like, parameter, parameters, &(struct written){.count = 1, .text = &text}, reason, sizeof reason);
+    if (!good) {
+        refuse(client, "block %s: parameter %s: %s", block->name, parameter->name, reason);
+    } else if (type->configure && type->configure(like) != FL_OK) {
+        good = refuse(client, "block %s: %s", block->name, like->service->failure);
+    } else {
+        memcpy(value, (const char *)parameters + parameter->offset, parameter_size(parameter->kind));
+    }
+    block_destroy(like);
+    return good;
+}
+
+/* Until the control thread has taken what is offered. False, and it never will: when it makes no step, and when there
+ * is nobody any more who could be told. */
+static bool await_taken(struct tuner *tuner, struct client *client, uint64_t *step)
+{
+    int64_t deadline_ns = fl_now_ns() + 2 * tuner->task->period_ns + CLIENT_MS * MILLISECOND_NS;
+    for (;;) {
+        struct pollfd waiting[] = {{0}, {.fd = tuner->change.taken_fd, .events = POLLIN}, {.fd = client->fd}};
+        bool ready = await(tuner, waiting, 3, deadline_ns);
+        if (change_taken(&tuner->change, step))
+            return true;
+        if (ready && !waiting[2].revents)
+            continue;
+        if (change_withdraw(&tuner->change))
+            return refuse(client, "the task makes no step; nothing is changed");
+        poll(&waiting[1], 1, -1); /* it is being taken at this moment */
+    }
+}
+
+static bool set(struct tuner *tuner, struct client *client, char *name, const char *text)
+{
+    unsigned char value[CHANGE_BYTES];
+    uint64_t step;
+    struct fl_block *block;
+    const struct fl_parameter *parameter = find(tuner, client, name, &block);
+    if (!parameter)
+        return false;
+    if (!tunable(parameter))
+        return refuse(client, "block %s: parameter %s cannot be set while the task runs", block->name, parameter->name);
+    if (!judge(client, block, parameter, text, value))
+        return false;
+    fprintf(client->answer, "%s.%s: ", block->name, parameter->name);
+    parameter_write(parameter, block->parameters, client->answer);
+    char *place = (char *)(uintptr_t)block->parameters + parameter->offset;
+    change_offer(&tuner->change, place, value, parameter_size(parameter->kind));
+    if (!await_taken(tuner, client, &step))
+        return false;
+    fputs(" → ", client->answer);
+    parameter_write(parameter, block->parameters, client->answer);
+    fprintf(client->answer, " from step %" PRIu64 " on\n", step);
+    return true;
+}
+
+static bool obey(struct tuner *tuner, struct client *client)
+{
+    char *rest = client->request, *verb = strsep(&rest, " "), *name = strsep(&rest, " ");
+    if (strcmp(verb, "list") == 0 && !name)
+        return list(tuner, client);
+    if (strcmp(verb, "get") == 0 && name && !rest)
+        return get(tuner, client, name);
+    if (strcmp(verb, "set") == 0 && name && rest)
+        return set(tuner, client, name, rest);
+    return refuse(client, "there is: list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE");
+}
+
+/* --- clients --- */
+
+/* A line, without its end; false when none comes. */
+static bool receive(const struct tuner *tuner, struct client *client)
+{
+    size_t used = 0;
+    int64_t deadline_ns = deadline_in(CLIENT_MS);
+    struct pollfd waiting[] = {{0}, {.fd = client->fd, .events = POLLIN}};
+    while (await(tuner, waiting, 2, deadline_ns)) {
+        ssize_t got = recv(client->fd, client->request + used, sizeof client->request - used, MSG_DONTWAIT);
+        if (got <= 0)
+            return false;
+        char *end = memchr(client->request + used, '\n', (size_t)got);
+        used += (size_t)got;
+        if (end) {
+            *end = '\0';
+            return strlen(client->request) == (size_t)(end - client->request);
+        }
+        if (used == sizeof client->request)
+            return false;
+    }
+    return false;
+}
+
+static void send_all(const struct tuner *tuner, const struct client *client, const char *text, size_t length)
+{
+    int64_t deadline_ns = deadline_in(CLIENT_MS);
+    struct pollfd waiting[] = {{0}, {.fd = client->fd, .events = POLLOUT}};
+    while (length && await(tuner, waiting, 2, deadline_ns)) {
+        ssize_t sent = send(client->fd, text, length, MSG_DONTWAIT | MSG_NOSIGNAL);
+        if (sent < 0)
+            return;
+        text += sent;
+        length -= (size_t)sent;
+    }
+}
+
+static void serve_client(struct tuner *tuner, struct client *client)
+{
+    char *text = NULL;
+    size_t length = 0;
+    client->answer = open_memstream(&text, &length);
+    if (!client->answer)
+        return;
+    if (receive(tuner, client)) {
+        bool setting = strncmp(client->request, "set", 3) == 0;
+        fputs("ok\n", client->answer);
+        bool done = obey(tuner, client);
+        fflush(client->answer);
+        if (done && setting)
+            fprintf(stderr, "flotilla: %s: user %u: %s", tuner->task->name, (unsigned)client->user, text + 3);
+        if (!done) {
+            rewind(client->answer);
+            fprintf(client->answer, "error\n%s\n", client->reason);
+        }
+        fflush(client->answer);
+        send_all(tuner, client, text, length);
+    }
+    fclose(client->answer);
+    free(text);
+}
+
+static void *serve(void *argument)
+{
+    struct tuner *tuner = argument;
+    struct pollfd waiting[] = {{0}, {.fd = tuner->listen_fd, .events = POLLIN}};
+    while (await(tuner, waiting, 2, FOR_EVER)) {
+        struct ucred peer = {.uid = (uid_t)-1};
+        struct client client = {.fd = accept4(tuner->listen_fd, NULL, NULL, SOCK_CLOEXEC)};
+        if (client.fd < 0) {
+            if (errno != EAGAIN) /* no descriptor is left, or no memory: that may pass */
+                await(tuner, waiting, 1, deadline_in(CLIENT_MS));
+            continue;
+        }
+        getsockopt(client.fd, SOL_SOCKET, SO_PEERCRED, &peer, &(socklen_t){sizeof peer});
+        client.user = peer.uid;
+        serve_client(tuner, &client);
+        close(client.fd);
+    }
+    return NULL;
+}
+
+/* --- its life --- */
+
+/* Whether a socket is there that nobody listens at any more. */
+static bool left_behind(const struct sockaddr_un *address)
+{
+    struct stat file;
+    if (lstat(address->sun_path, &file) < 0 || !S_ISSOCK(file.st_mode))
+        return false;
+    int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
+    bool dead = fd >= 0 && connect(fd, (const struct sockaddr *)address, sizeof *address) < 0 && errno == ECONNREFUSED;
+    if (fd >= 0)
+        close(fd);
+    return dead;
+}
+
+static int listening(const char *path)
+{
+    struct sockaddr_un address = {.sun_family = AF_UNIX};
+    if (strlen(path) >= sizeof address.sun_path) {
+        errno = ENAMETOOLONG;
+        return -1;
+    }
+    memcpy(address.sun_path, path, strlen(path) + 1);
+    int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
+    if (fd < 0)
+        return -1;
+    if (left_behind(&address))
+        unlink(path);
+    if (fchmod(fd, 0600) == 0 /* before it has a name */
+        && bind(fd, (const struct sockaddr *)&address, sizeof address) == 0 && listen(fd, QUEUED) == 0)
+        return fd;
+    int error = errno;
+    close(fd);
+    errno = error;
+    return -1;
+}
+
+struct tuner *tuner_create(const char *path, struct task *task)
+{
+    struct tuner *tuner = aligned_alloc(_Alignof(struct tuner), sizeof *tuner);
+    if (!tuner)
+        abort();
+    *tuner = (struct tuner){.task = task, .path = strdup(path)};
+    tuner->listen_fd = listening(path);
+    if (tuner->listen_fd < 0) {
+        fprintf(stderr, "flotilla: %s: %s: parameters cannot be set while it runs\n", path,
+                errno == EADDRINUSE ? "it is there already, and is another task's or no socket" : strerror(errno));
+        free(tuner->path);
+        free(tuner);
+        return NULL;
+    }
+    tuner->stop_fd = eventfd(0, EFD_CLOEXEC);
+    if (!tuner->path || tuner->stop_fd < 0 || change_initialize(&tuner->change) < 0)
+        abort();
+    return tuner;
+}
+
+void tuner_destroy(struct tuner *tuner)
+{
+    if (!tuner)
+        return;
+    tuner_stop(tuner);
+    unlink(tuner->path);
+    close(tuner->listen_fd);
+    close(tuner->stop_fd);
+    change_clear(&tuner->change);
+    free(tuner->path);
+    free(tuner);
+}
+
+int tuner_start(struct tuner *tuner)
+{
+    struct fl_service ordinary = {0};
+    int error = fl_service_thread(&ordinary, &tuner->thread, "tuner", serve, tuner);
+    tuner->started = !error;
+    return error;
+}
+
+struct change *tuner_change(struct tuner *tuner)
+{
+    return &tuner->change;
+}
+
+void tuner_stop(struct tuner *tuner)
+{
+    if (!tuner->started)
+        return;
+    eventfd_write(tuner->stop_fd, 1);
+    pthread_join(tuner->thread, NULL);
+    tuner->started = false;
+}
