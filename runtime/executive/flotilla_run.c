@@ -20,7 +20,7 @@ static const char usage[] =
     "  --no-wait           do not wait for releases: time is counted, not measured\n"
     "  --watch SIGNALS     print block.port,block.port[2],... each step, a line of JSON each\n"
     "  --statistics FILE   write times, jitter and overruns as JSON at the end\n"
-    "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS ")\n"
+    "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS "); several are separated by ':'\n"
     "  --help, --version\n"
     "\n"
     "Status: 0 ended as asked, 1 the task failed (outputs are in their reset state), 2 the command line or the task\n"
