@@ -35,6 +35,15 @@ verify: | setup ## build a second time under other circumstances and compare to 
 size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size --robot $(call need,ROBOT)
 
+##@ Apps
+.PHONY: new-app deploy
+new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|make NAME=hover
+	$(Q)$(FLOTILLA) new-app --kind $(call need,KIND) --name $(call need,NAME)
+
+deploy: | setup ## build, send and run one until Ctrl-C: make deploy ROBOT=3 APP=dir [KEEP=1 | RUN=start|stop|status|log|remove]
+	$(Q)$(FLOTILLA) deploy --robot $(call need,ROBOT) --app $(call need,APP) $(if $(RUN),--run $(RUN)) \
+	    $(if $(filter-out 0,$(KEEP)),--keep)
+
 ##@ Inputs
 .PHONY: lock check-fleet requirements
 lock: | setup ## resolve the package lists against the mirror: exact versions and hashes
