@@ -46,11 +46,20 @@ fleet-status: | setup-tests ## what the guests of the virtual fleet do
 fleet-down: | setup-tests ## end the virtual fleet
 	$(Q)$(PYTHON) -m tests.lab.fleet down
 
-provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [PLAYBOOK=fleet ARGS=--check]
+provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [ARGS=--check]
 	$(Q)cd ansible && export PATH="$(abspath $(VENV))/bin:$$PATH" BUILD="$(abspath $(BUILD))" && \
 	    $(if $(KEYS),KEYS="$(abspath $(KEYS))") ansible-playbook -i inventory \
 	    $(if $(filter guests,$(ON)),-i $(abspath $(BUILD))/fleet/guests.yml -l $(if $(ROBOT),robot$(ROBOT),guests), \
 	        $(if $(ROBOT),-l robot$(ROBOT))) $(ARGS) $(or $(PLAYBOOK),fleet).yml
+
+##@ Apps
+.PHONY: new-app deploy
+new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|make NAME=hover
+	$(Q)$(FLOTILLA) new-app --kind $(call need,KIND) --name $(call need,NAME)
+
+deploy: | setup ## build, send and run an app: make deploy ROBOT=3 APP=dir [KEEP=1 | RUN=start|stop|status|log|remove]
+	$(Q)$(FLOTILLA) deploy --robot $(call need,ROBOT) --app $(call need,APP) $(if $(RUN),--run $(RUN)) \
+	    $(if $(filter-out 0,$(KEEP)),--keep)
 
 ##@ Inputs
 .PHONY: lock check-fleet requirements

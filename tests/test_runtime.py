@@ -337,6 +337,18 @@ def test_a_plugin_of_another_interface_is_refused(tasks: Tasks, tmp_path: Path) 
     assert "there is no block misbehave" in lines[-1]
 
 
+def test_plugins_come_from_several_directories_where_one_may_be_missing(tasks: Tasks, tmp_path: Path) -> None:
+    """Seen to fail when only the first directory is read."""
+    own = tmp_path / "own"
+    own.mkdir()
+    compile_shared(PLUGIN / "loopback.c", own / "loopback.so", f"-I{HEADERS}")
+    file = tasks.write(task("bad: {type: misbehave, parameters: {manner: fail}}"))
+    for directories in (f"{own}:{tasks.plugins}", f"{tmp_path / 'missing'}:{tasks.plugins}:{own}"):
+        argv = [str(tasks.program), "--check", "--blocks", directories, str(file)]
+        done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_the_graph_names_blocks_and_wires(tasks: Tasks) -> None:
     text = task("a: {type: gain, every: 2, in: {in: 1}}\nb: {type: gain, in: {in: a.out}}")
     drawn = subprocess.run(tasks.argv(text, "--dot"), capture_output=True, text=True, check=True).stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import sys
 from collections.abc import Callable
@@ -42,6 +43,25 @@ def _ssh(arguments: argparse.Namespace) -> None:
     from images.builder import boot, inventory
 
     boot.ssh(inventory.robot(inventory.load_fleet(), arguments.robot))
+
+
+def _deploy(arguments: argparse.Namespace) -> None:
+    from images.builder import app, app_deploy, app_robot, inventory
+
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    with app_robot.connection(robot) as to:
+        if arguments.run:
+            print(app_deploy.command(to, app.name_of(arguments.app), arguments.run))
+        else:
+            board, show = fleet.boards[robot.board], functools.partial(print, flush=True)
+            print(app_deploy.deploy(to, arguments.app, board, keep=arguments.keep, show=show))
+
+
+def _new_app(arguments: argparse.Namespace) -> None:
+    from images.builder import app_new
+
+    print(app_new.create(arguments.kind, arguments.name))
 
 
 def _verify(arguments: argparse.Namespace) -> None:
@@ -111,6 +131,8 @@ _COMMANDS: dict[str, tuple[Callable[[argparse.Namespace], None], str]] = {
     "flash": (_flash, "write a card and read it back"),
     "boot": (_boot, "boot an image in QEMU"),
     "ssh": (_ssh, "shell on a robot"),
+    "deploy": (_deploy, "bring an app to a robot and run it"),
+    "new-app": (_new_app, "make a working start of an app"),
     "size": (_size, "what takes the room of an image"),
     "verify": (_verify, "build a second time under other circumstances and compare"),
     "hwcheck": (_hwcheck, "what a robot's hardware is and does"),
@@ -127,8 +149,25 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m images.builder", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     made = {name: commands.add_parser(name, help=text) for name, (_, text) in _COMMANDS.items()}
-    for name in ("image", "flash", "boot", "ssh", "size", "verify", "hwcheck", "param", "bench", "rotate-key"):
+    for name in (
+        "image",
+        "flash",
+        "boot",
+        "ssh",
+        "deploy",
+        "size",
+        "verify",
+        "hwcheck",
+        "param",
+        "bench",
+        "rotate-key",
+    ):
         made[name].add_argument("--robot", type=int, help="number in the inventory")
+    made["deploy"].add_argument("--app", type=Path, required=True, help="the app's directory")
+    made["deploy"].add_argument("--run", help="start, stop, status, log or remove what is on the robot")
+    made["deploy"].add_argument("--keep", action="store_true", help="start it with the robot")
+    made["new-app"].add_argument("--kind", required=True)
+    made["new-app"].add_argument("--name", required=True)
     made["kernel"].add_argument("--board", required=True, help="name in kernel/kernels.yml")
     made["image"].add_argument("--all", action="store_true", help="every robot of the fleet")
     made["hwcheck"].add_argument(

@@ -74,7 +74,7 @@ def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
         for path, (content, _) in identity.render(fleet, robot).items() if robot.control_tasks else ():
             if path.parent == identity.TASKS:
                 try:
-                    runtime.check_task(path.stem, content)
+                    runtime.check_task(paths.TASKS / path.name, content)
                 except UserError as error:
                     problems.append(f"{robot.name}: {error}")
     if problems:

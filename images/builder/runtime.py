@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from images.builder.lock import read_lock
 SOURCE = paths.PROJECT / "runtime"
 LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libsystemd0", "libyaml-0-2")
 """Packages whose libraries its programs load; robots have them from images/packages/robot.list."""
+WARNINGS = ("-Wall", "-Wextra", "-Werror")
+"""Compiler options for code that is written by hand."""
 _LEFT_OUT = ("bench", "station", "tests")
 """Folders of the source that no package comes from."""
 
@@ -39,30 +42,68 @@ class Runtime:
         return package
 
 
-def compile_plugin(source: Path, architecture: str) -> bytes:
-    """A C file as a plug-in with blocks for robots of an architecture; errors are the compiler's own words."""
-    command = ["gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC", "-s", "-I/out/include"]
-    command += ["-Wl,--build-id=none"]
-    return toolchain.compile_by(f"runtime-{architecture}", command, [source, SOURCE / "include"], ["-lm"])
+def command(work: Path, architecture: str, argv: Sequence[str]) -> None:
+    """Run a command among the locked compiler and libraries of an architecture; errors are its own words.
+
+    There, `work` is /out, and gets the public headers in /out/include.
+    """
+    shutil.copytree(SOURCE / "include", work / "include")
+    toolchain.run(f"runtime-{architecture}", work, argv, paths.BUILD / f"compile-{architecture}.log")
 
 
-def check_task(name: str, content: bytes) -> None:
-    """Let the runtime judge a task as the robot would; UserError with all that is wrong."""
+def compile_plugin(source: Path, architecture: str, options: Sequence[str] = WARNINGS) -> bytes:
+    """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture."""
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".plugin-") as directory:
+        work = Path(directory)
+        if source.is_dir():
+            shutil.copytree(source, work / "source")
+        else:
+            (work / "source").mkdir()
+            shutil.copy(source, work / "source")
+        argv = ["env", "-C", "/out/source", "gcc", "-std=c11", *options, "-O2", "-shared", "-fPIC", "-s"]
+        argv += ["-fvisibility=hidden", "-I/out/include", "-Wl,--build-id=none", "-o", "/out/plugin.so"]
+        argv += [*sorted(file.name for file in (work / "source").glob("*.c")), "-lm"]
+        command(work, architecture, argv)
+        return (work / "plugin.so").read_bytes()
+
+
+def check_plugins(directory: Path) -> None:
+    """Let the runtime judge plug-ins for amd64: the interface that they were made for, names that are taken."""
+    done = _run("flotilla-blocks", "--blocks", str(directory))
+    if done.returncode:
+        raise UserError(done.stderr.replace(f"{directory}/", "").strip())
+
+
+def check_task(path: Path, content: bytes, plugins: Path | None = None) -> None:
+    """Let the runtime judge a task as the robot would; UserError with all that is wrong in `path`.
+
+    `plugins`: a directory with blocks that the runtime lacks, for amd64.
+    """
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".task-") as directory:
+        file = Path(directory) / path.name
+        file.write_bytes(content)
+        directories = ":".join(str(each) for each in (plugins, _programs() / "usr/lib/flotilla/blocks") if each)
+        done = _run("flotilla-run", "--check", "--blocks", directories, str(file))
+        if done.returncode:
+            raise UserError(done.stderr.replace(str(file), paths.shown(path)).strip())
+
+
+def _programs() -> Path:
+    """The runtime for amd64, unpacked."""
     made = build("amd64")
-    tree = tools.tree(read_lock("runtime-amd64"))
 
     def unpack(out: Path) -> None:
         subprocess.run(["dpkg-deb", "-x", str(made.package), str(out)], check=True)
 
-    programs = cache.result("runtime-programs", made.directory.name.removeprefix("runtime-"), unpack)
-    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".task-") as directory:
-        file = Path(directory) / f"{name}.yml"
-        file.write_bytes(content)
-        loader = f"{tree}/lib64/ld-linux-x86-64.so.2", "--library-path", f"{tree}/usr/lib/x86_64-linux-gnu"
-        check = f"{programs}/usr/bin/flotilla-run", "--check", "--blocks", f"{programs}/usr/lib/flotilla/blocks"
-        done = subprocess.run([*loader, *check, file], capture_output=True, encoding="utf-8", check=False)
-        if done.returncode:
-            raise UserError(done.stderr.replace(str(file), paths.shown(paths.TASKS / file.name)).strip())
+    return cache.result("runtime-programs", made.directory.name.removeprefix("runtime-"), unpack)
+
+
+def _run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a program of the runtime on this computer, whatever libraries that has."""
+    tree = tools.tree(read_lock("runtime-amd64"))
+    argv = [str(tree / "lib64/ld-linux-x86-64.so.2"), "--library-path", str(tree / "usr/lib/x86_64-linux-gnu")]
+    argv += [str(_programs() / "usr/bin" / program), *arguments]
+    return subprocess.run(argv, capture_output=True, encoding="utf-8", check=False)
 
 
 def sources() -> list[Path]:

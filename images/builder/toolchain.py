@@ -24,24 +24,21 @@ _OPTIONS = ["-O2", "-Wl,--build-id=none", "-s"]
 
 def compile_static(source: Path, architecture: str, options: Sequence[str] = ()) -> bytes:
     """A C file as a program that needs nothing of the robot's libraries; errors are the compiler's own words."""
-    return compile_by("toolchain", ["gcc-12", *_ARCHITECTURES[architecture], *_OPTIONS, "-static", *options], [source])
-
-
-def compile_by(lock_name: str, command: Sequence[str], sources: Sequence[Path], libraries: Sequence[str] = ()) -> bytes:
-    """What `command`, a compiler of that lock, makes of the first of `sources`; beside it lie the others, files or
-    directories."""
-    lock = read_lock(lock_name)
-    pool.fill([lock])
-    tree = tools.tree(lock)
     paths.BUILD.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".compile-") as directory:
         work = Path(directory)
-        for source in sources:
-            (shutil.copytree if source.is_dir() else shutil.copy)(source, work / source.name)
-        line = [*command, "-o", "/out/made", f"/out/{sources[0].name}", *libraries]
-        stage = {"tools": str(tree), "epoch": lock.epoch, "out": directory, "command": line}
-        namespace.run_stage(__name__, [json.dumps(stage)], work / "log")
+        shutil.copy(source, work)
+        argv = ["gcc-12", *_ARCHITECTURES[architecture], *_OPTIONS, "-static", *options]
+        run("toolchain", work, [*argv, "-o", "/out/made", f"/out/{source.name}"], work / "log")
         return (work / "made").read_bytes()
+
+
+def run(lock_name: str, work: Path, command: Sequence[str], log: Path) -> None:
+    """Run a command among the packages of a lock, where `work` is /out; errors are its own words, kept in `log`."""
+    lock = read_lock(lock_name)
+    pool.fill([lock])
+    stage = {"tools": str(tools.tree(lock)), "epoch": lock.epoch, "out": str(work), "command": list(command)}
+    namespace.run_stage(__name__, [json.dumps(stage)], log)
 
 
 def main(description: str) -> None:

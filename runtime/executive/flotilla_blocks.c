@@ -6,10 +6,11 @@
 #include <getopt.h>
 #include <string.h>
 
-static const char usage[] = "usage: flotilla-blocks [--blocks DIRECTORY] [NAME]...\n"
-                            "List all blocks, a line each; of the named ones all ports and parameters.\n"
-                            "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS ")\n"
-                            "  --help, --version\n";
+static const char usage[] =
+    "usage: flotilla-blocks [--blocks DIRECTORY] [NAME]...\n"
+    "List all blocks, a line each; of the named ones all ports and parameters.\n"
+    "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS "); several are separated by ':'\n"
+    "  --help, --version\n";
 
 static const char *const kinds[] = {
     [FL_KIND_BOOLEAN] = "boolean", [FL_KIND_INTEGER] = "integer", [FL_KIND_REAL] = "real",

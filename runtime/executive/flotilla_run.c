@@ -23,7 +23,7 @@ static const char usage[] =
     "  --statistics FILE   write times, jitter and overruns as JSON at the end\n"
     "  --control PATH      socket at which flotilla-param reads and sets parameters\n"
     "                      (default: control in $RUNTIME_DIRECTORY, as a service has one; otherwise none)\n"
-    "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS ")\n"
+    "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS "); several are separated by ':'\n"
     "  --help, --version\n"
     "\n"
     "Status: 0 ended as asked, 1 the task failed (outputs are in their reset state), 2 the command line or the task\n"

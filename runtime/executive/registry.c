@@ -99,15 +99,16 @@ unsigned registry_fill(struct registry *registry, const char *plugins, FILE *out
     return add(registry, types, count, "flotilla");
 }
 
-unsigned registry_load_plugins(struct registry *registry)
+/* Load the plug-ins of the first directory that waits. */
+static unsigned load_next(struct registry *registry)
 {
     glob_t found;
     char pattern[4096];
     unsigned faults = 0;
-    if (!registry->plugins)
-        return 0;
-    snprintf(pattern, sizeof pattern, "%s/*.so", registry->plugins);
-    registry->plugins = NULL;
+    const char *directory = registry->plugins;
+    size_t length = strcspn(directory, ":");
+    registry->plugins = directory[length] ? directory + length + 1 : NULL;
+    snprintf(pattern, sizeof pattern, "%.*s/*.so", (int)length, directory);
     if (glob(pattern, 0, NULL, &found) == 0) {
         for (size_t i = 0; i < found.gl_pathc; i++)
             faults += add_plugin(registry, found.gl_pathv[i]);
@@ -116,11 +117,19 @@ unsigned registry_load_plugins(struct registry *registry)
     return faults;
 }
 
+unsigned registry_load_plugins(struct registry *registry)
+{
+    unsigned faults = 0;
+    while (registry->plugins)
+        faults += load_next(registry);
+    return faults;
+}
+
 const struct fl_block_type *registry_find(struct registry *registry, const char *name)
 {
     const struct fl_block_type *found = find(registry, name);
-    if (!found && registry->plugins) {
-        registry_load_plugins(registry);
+    while (!found && registry->plugins) {
+        load_next(registry);
         found = find(registry, name);
     }
     return found;

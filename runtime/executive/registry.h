@@ -8,15 +8,16 @@
 struct registry {
     const struct fl_block_type **types; /* by name */
     size_t count;
-    const char *plugins; /* a directory of *.so that are loaded when a block is wanted that the program lacks */
-    FILE *out;           /* what is wrong with types and plug-ins */
+    const char
+        *plugins; /* directories, separated by ':', of *.so that wait until a block is wanted which is not there */
+    FILE *out;    /* what is wrong with types and plug-ins */
 };
 
-/* The program's own blocks. `plugins` may be NULL, or a directory that does not exist. Number of
- * faulty types, which are left out. */
+/* The program's own blocks. `plugins` may be NULL, and a directory of it may not exist; it must live as long as the
+ * registry. Number of faulty types, which are left out. */
 unsigned registry_fill(struct registry *registry, const char *plugins, FILE *out);
 
-/* Load the plug-ins, if they are not loaded yet. Number of those, and of their types, that were faulty and left out. */
+/* Load the plug-ins that are not loaded yet. Number of those, and of their types, that were faulty and left out. */
 unsigned registry_load_plugins(struct registry *registry);
 
 /* NULL: neither the program nor a plug-in has it. */

@@ -1,0 +1,65 @@
+"""`make deploy`: an app built, sent to a robot and run there, or what became of one that was sent before."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from images.builder import app, app_build, app_robot
+from images.builder.errors import UserError
+from images.builder.fleet import Board
+
+Run = Callable[[app_robot.Connection, str], str]
+
+
+def _start(to: app_robot.Connection, name: str) -> str:
+    app_robot.start(to, name)
+    return app_robot.status(to, name)
+
+
+def _log(to: app_robot.Connection, name: str) -> str:
+    app_robot.follow_log(to, name)
+    return ""
+
+
+def _remove(to: app_robot.Connection, name: str) -> str:
+    app_robot.remove(to, name)
+    return f"{name} is gone from {to.robot.name}"
+
+
+RUNS: dict[str, Run] = {
+    "start": _start,
+    "stop": app_robot.stop,
+    "status": app_robot.status,
+    "log": _log,
+    "remove": _remove,
+}
+"""What RUN= does with an app that is on the robot."""
+
+
+def command(to: app_robot.Connection, name: str, run: str) -> str:
+    """One of RUNS; what came of it."""
+    if run not in RUNS:
+        raise UserError(f"RUN={run}: is none of {', '.join(RUNS)}")
+    return RUNS[run](to, name)
+
+
+def deploy(to: app_robot.Connection, directory: Path, board: Board, *, keep: bool, show: app_robot.Show) -> str:
+    """Build the app and bring it to the robot. Then run it until it ends or KeyboardInterrupt ends it, and report; or,
+    to `keep` it, let it go on by itself, now and whenever the robot starts."""
+    subject = app.load(directory)
+    app.check_board(subject, to.robot, board)
+    place(to, subject, board)
+    if not keep:
+        return app_robot.run(to, subject.name, show)
+    app_robot.keep(to, subject.name)
+    return _start(to, subject.name)
+
+
+def place(to: app_robot.Connection, subject: app.App, board: Board) -> None:
+    """Build the app and put it on the robot; it does not run."""
+    with tempfile.TemporaryDirectory(prefix="flotilla-app-") as work:
+        files = Path(work) / subject.name
+        app_build.build(subject, board, files)
+        app_robot.send(to, subject, board, files)

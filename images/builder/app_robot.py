@@ -1,0 +1,234 @@
+"""Apps on a robot: sent, started, watched, ended and removed over SSH.
+
+An app lies in /data/apps/NAME, a link to the version beside it: it changes at once or not at all. It runs as
+flotilla-app@NAME.service.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shlex
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from images.builder import app, boot, cache, paths, progress
+from images.builder.errors import UserError
+from images.builder.fleet import Board, Robot
+
+Show = Callable[[str], None]
+"""Takes a line of the app's log."""
+_SCRIPT = Path(__file__).with_suffix(".sh")
+_RESERVE_KIB = 4096
+"""Of the data partition, for the robot's journal and an app's statistics."""
+_MACHINES = {"i386": "i?86", "amd64": "x86_64"}
+"""What uname says, as a pattern of the shell's, by Debian's name of the architecture."""
+
+_ENDED = {"7ad2d189f7e94e70a38c781354912448": "success", "d9b373ed55a64feb8242e02dbe79a49c": "failure"}
+"""MESSAGE_ID of what the service manager says when a service has ended (systemd's sd-messages.h); its result."""
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A way to a robot."""
+
+    robot: Robot
+    ssh: Sequence[str]
+    """The command line that reaches it, up to what it is to run there."""
+
+    def argv(self, command: str, name: str, *arguments: str) -> list[str]:
+        """What runs a command of app_robot.sh for the app `name`."""
+        words = ["sudo", "sh", "-c", _SCRIPT.read_text(), "flotilla", command, name, *arguments]
+        return [*self.ssh, shlex.join(words)]
+
+    def run(self, command: str, name: str, *arguments: str, stdin: bytes = b"") -> str:
+        """Run it; what it says. UserError with the reason when it refuses or the robot does not answer."""
+        done = subprocess.run(self.argv(command, name, *arguments), input=stdin, capture_output=True, check=False)
+        if done.returncode:
+            raise self.error(done.returncode, done.stderr.decode(errors="replace"))
+        return done.stdout.decode(errors="replace")
+
+    def error(self, status: int, said: str) -> UserError:
+        """Why something failed on the robot, or on the way."""
+        name, said = self.robot.name, said.strip()
+        if status != 255:
+            return UserError(f"{name}: {said or f'status {status}'}")
+        if "Host key verification failed" in said or "IDENTIFICATION HAS CHANGED" in said:
+            return UserError(
+                f"{name}: refused, because its host key is not the one of {paths.shown(paths.KEYS / 'known_hosts')}: "
+                "another robot's card is in it, its image was made with other keys, or somebody is in between\n" + said
+            )
+        return UserError(
+            f"{name} did not answer: {said or 'the connection broke'}; is it on and reachable? "
+            f"`make ssh ROBOT={self.robot.number}`"
+        )
+
+
+@contextmanager
+def connection(robot: Robot, ssh: Sequence[str] | None = None) -> Iterator[Connection]:
+    """One connection that all commands share; `ssh` for another way than the inventory's."""
+    program, *way = ssh or boot.ssh_command(robot)
+    with tempfile.TemporaryDirectory(prefix="flotilla-") as directory:  # short: it holds a socket
+        settings = ["ControlMaster=auto", f"ControlPath={directory}/master", "ControlPersist=60", "ConnectTimeout=20"]
+        settings += ["ServerAliveInterval=10", "ServerAliveCountMax=6"]
+        options = [word for setting in settings for word in ("-o", setting)]
+        try:
+            yield Connection(robot, [program, *options, *way])
+        finally:
+            subprocess.run([program, *options, "-O", "exit", *way], capture_output=True, check=False)
+
+
+def send(to: Connection, subject: app.App, board: Board, files: Path) -> None:
+    """Put the built app `files` in the place of what the robot has of it, and end that."""
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        tar.add(files, arcname=".", filter=_plain)
+    size = sum(file.stat().st_size for file in files.rglob("*") if file.is_file())
+    need_kib = size // 1024 + _RESERVE_KIB
+    description = subject.description
+    program = Path(description.program).name if isinstance(description, app.Make) else ""
+    version = cache.digest(*sorted(files.iterdir()))[:16]
+    arguments = [version, _MACHINES[board.architecture], str(need_kib), program]
+    with progress.step(f"{subject.name} to {to.robot.name}, {progress.size(size)}"):
+        to.run("receive", subject.name, *arguments, stdin=archive.getvalue())
+
+
+def keep(to: Connection, name: str) -> None:
+    """Let it start with the robot."""
+    to.run("keep", name)
+
+
+def start(to: Connection, name: str) -> None:
+    """Start it; it goes on by itself."""
+    to.run("start", name)
+
+
+def stop(to: Connection, name: str) -> str:
+    """End it; its report."""
+    to.run("stop", name)
+    return report(to, name)
+
+
+def remove(to: Connection, name: str) -> None:
+    """End it, and remove all of it."""
+    to.run("remove", name)
+
+
+def status(to: Connection, name: str) -> str:
+    """Whether it runs, since when, and whether it starts with the robot; a line each."""
+    return to.run("status", name).strip()
+
+
+def run(to: Connection, name: str, show: Show) -> str:
+    """Start it anew and show its log until it ends, or until KeyboardInterrupt ends it; its report."""
+    # In a session of its own: Ctrl-C ends the app and not the log, whose last lines say what came of it.
+    argv = [*boot.DIE_WITH_PARENT, *to.argv("run", name)]
+    log: list[str] = []
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        argv, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    ) as process:
+        assert process.stdout
+        assert process.stderr
+
+        def take(line: str) -> dict[str, Any]:
+            entry: dict[str, Any] = json.loads(line)
+            log.append(_message(entry))
+            show(log[-1])
+            return entry
+
+        try:
+            entry: dict[str, Any] = {}
+            interrupted = False
+            while entry.get("MESSAGE_ID") not in _ENDED:
+                try:
+                    if not (line := process.stdout.readline()):
+                        raise to.error(process.wait(), process.stderr.read())
+                    entry = take(line)
+                except KeyboardInterrupt:
+                    if interrupted:
+                        raise
+                    interrupted = True
+                    to.run("stop", name)
+        finally:
+            process.kill()
+    for line in to.run("rest", name, entry["__CURSOR"]).splitlines():
+        take(line)
+    _write(to, name, "log", "".join(f"{line}\n" for line in log))
+    said = report(to, name)
+    if _ENDED[entry["MESSAGE_ID"]] != "success":
+        result = entry.get("UNIT_RESULT", "it failed")
+        remedy = f"its log is {paths.shown(_file(to, name, 'log'))}"
+        raise UserError("\n".join(filter(None, (said, f"{to.robot.name}: {name} ended: {result}; {remedy}"))))
+    return said
+
+
+def _message(entry: dict[str, Any]) -> str:
+    """The text of a journal's entry in JSON, where bytes that are no text come as a list of numbers."""
+    message = entry.get("MESSAGE")
+    return bytes(message).decode(errors="replace") if isinstance(message, list) else message or ""
+
+
+def follow_log(to: Connection, name: str) -> None:
+    """Its last lines and all that come, on standard output, until KeyboardInterrupt."""
+    sys.stdout.flush()
+    with suppress(KeyboardInterrupt):
+        done = subprocess.run([*boot.DIE_WITH_PARENT, *to.argv("log", name)], check=False)
+        if done.returncode:
+            raise to.error(done.returncode, "what it says is above")
+
+
+def report(to: Connection, name: str) -> str:
+    """What it measured when it ended; empty when it wrote nothing. The file is brought along."""
+    text = to.run("statistics", name)
+    if not text:
+        return ""
+    _write(to, name, "json", text)
+    try:
+        lines = summary(json.loads(text))
+    except (ValueError, KeyError, TypeError):
+        lines = ["its statistics are not those of flotilla-run"]
+    return "\n".join([*lines, f"all of it: {paths.shown(_file(to, name, 'json'))}"])
+
+
+def summary(statistics: dict[str, Any]) -> list[str]:
+    """What flotilla-run's statistics say about real time, a line each."""
+
+    def times(what: dict[str, Any]) -> str:
+        mean, most, largest = (what[key] / 1000 for key in ("mean_ns", "p99_ns", "max_ns"))
+        return f"mean {mean:.1f} µs, 99 % {most:.1f} µs, max {largest:.1f} µs"
+
+    return [
+        f"period {statistics['period_ns'] / 1e6:g} ms, {statistics['steps']} steps, "
+        f"{statistics['overruns']} overruns, {statistics['skipped']} skipped",
+        f"jitter: {times(statistics['jitter'])}",
+        f"step:   {times(statistics['step'])}",
+        *(f"  {block}: {times(what)}" for block, what in statistics.get("blocks", {}).items()),
+    ]
+
+
+def _file(to: Connection, name: str, kind: str) -> Path:
+    return paths.BUILD / "reports" / f"app-{to.robot.name}-{name}.{kind}"
+
+
+def _write(to: Connection, name: str, kind: str, text: str) -> None:
+    file = _file(to, name, kind)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    beside = file.with_name(f".{file.name}.new")
+    beside.write_text(text)
+    beside.rename(file)
+
+
+def _plain(member: tarfile.TarInfo) -> tarfile.TarInfo:
+    """Of nobody in particular."""
+    member.uid = member.gid = member.mtime = 0
+    member.uname = member.gname = ""
+    member.mode = 0o755 if member.isdir() or member.mode & 0o100 else 0o644
+    return member

@@ -1,0 +1,257 @@
+"""Apps brought to a robot: built, sent, run, ended, kept and removed, on one guest with a relay board.
+
+The guest does what robots do, and is reached by the same commands; only the way to it is the laboratory's.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from images.builder import app, app_deploy, app_new, app_robot, boot, paths
+from images.builder.errors import UserError
+from images.builder.fleet import Board, Fleet
+from tests.conftest import GuestFactory, RobotGuest
+from tests.emulators.ir104 import Ir104
+from tests.test_control_loop import RelayPorts
+
+pytestmark = pytest.mark.boot
+
+STUBBORN = r"""
+#include <signal.h>
+#include <stdio.h>
+#include <sys/io.h>
+#include <unistd.h>
+
+int main(int argc, char **argv)
+{
+    signal(SIGTERM, SIG_IGN);
+    if (argc != 2 || ioperm(0x300, 3, 1)) {
+        perror("stubborn");
+        return 1;
+    }
+    outb(0x03, 0x300);
+    printf("%s\n", argv[1]);
+    fflush(stdout);
+    for (;;)
+        pause();
+}
+"""
+SAID = "on: 50 % of $HOME"
+"""What the service manager must pass on as it stands."""
+RELAYS = (paths.PROJECT / "docs" / "apps.md").read_text().split("```yaml\n")[1].split("```")[0]
+"""The page's example of a safe.yml: two relays of the board at 0x300."""
+
+
+class Bench:
+    """The guest, its relays, and the directory of apps."""
+
+    def __init__(self, guest: RobotGuest, relays: Ir104, board: Board, apps: Path) -> None:
+        self.guest, self.relays, self.board, self.apps = guest, relays, board, apps
+
+    @contextmanager
+    def connection(self, number: int = 4, port: int | None = None) -> Iterator[app_robot.Connection]:
+        """To the guest, as if it were robot `number`, or to another port of this computer."""
+        robot = self.guest.robot.model_copy(update={"name": f"robot{number}", "number": number})
+        way = ["-p", str(port or self.guest.machine.ssh_port()), "127.0.0.1"]
+        with app_robot.connection(robot, ["ssh", "-F", "none", *boot.ssh_options(robot), *way]) as to:
+            yield to
+
+    def new(self, kind: str, name: str) -> Path:
+        """A new app as `make new-app` makes it; an earlier one of that name is gone."""
+        shutil.rmtree(self.apps / name, ignore_errors=True)
+        app_new.create(kind, name, self.apps)
+        return self.apps / name
+
+    def place(self, directory: Path) -> None:
+        """Build and send it; it does not run."""
+        with self.connection() as to:
+            app_deploy.place(to, app.load(directory), self.board)
+
+    def do(self, name: str, run: str) -> str:
+        with self.connection() as to:
+            return app_deploy.command(to, name, run)
+
+    def status(self, name: str) -> dict[str, str]:
+        return dict(line.split("=", 1) for line in self.do(name, "status").splitlines())
+
+    def wait_relays(self, *, on: bool) -> bool:
+        """Wait until the program's relays are on, or all are off."""
+        end = time.monotonic() + 20
+        while any(self.relays.relays) != on and time.monotonic() < end:
+            time.sleep(0.005)  # the board has no event; the loop is bounded
+        return any(self.relays.relays) == on
+
+
+@pytest.fixture(scope="module")
+def bench(module_guest: GuestFactory, fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Robot 4, which has no task of its own, with a relay board."""
+    relays = Ir104()
+    with ExitStack() as stack:
+        ports = stack.enter_context(RelayPorts(relays))
+        guest = module_guest(4, qemu_options={"extra": ports.arguments})
+        yield Bench(guest, relays, fleet.boards[guest.robot.board], tmp_path_factory.mktemp("apps"))
+
+
+def measured(said: str) -> tuple[float, int]:
+    """Period in ms and number of steps in an app's report."""
+    match = re.search(r"^period (\S+) ms, (\d+) steps, \d+ overruns, \d+ skipped\njitter: mean .* max ", said)
+    assert match, said
+    return float(match[1]), int(match[2])
+
+
+@pytest.mark.parametrize("kind", app.KINDS)
+def test_a_new_app_runs_until_it_is_interrupted_and_reports(bench: Bench, kind: str) -> None:
+    """Seen to fail where the app did not start at all: then there is no report, and no line to interrupt at."""
+    name = f"new-{kind}"
+    lines: list[str] = []
+
+    def show(line: str) -> None:
+        lines.append(line)
+        if line.startswith("Started"):
+            raise KeyboardInterrupt
+
+    with bench.connection() as to:
+        said = app_deploy.deploy(to, bench.new(kind, name), bench.board, keep=False, show=show)
+    period_ms, steps = measured(said)
+    assert (period_ms, steps > 0) == (10, True)
+    assert any("Deactivated successfully" in line for line in lines), "the log ends before the app does"
+    assert bench.status(name)["ActiveState"] == "inactive"
+    print(said)
+
+
+@pytest.mark.parametrize("kind", app.KINDS)
+def test_it_starts_and_stops_by_itself_again_and_again(bench: Bench, kind: str) -> None:
+    name = f"again-{kind}"
+    bench.place(bench.new(kind, name))
+    for _ in range(2):
+        assert "ActiveState=active" in bench.do(name, "start")
+        assert measured(bench.do(name, "stop"))[1] > 0
+    assert bench.status(name)["ActiveState"] == "inactive"
+
+
+def test_a_program_that_ignores_sigterm_is_ended_and_its_relays_are_reset(bench: Bench) -> None:
+    """Without safe.yml they stay on, and are off only once the next version is there and has ended."""
+    directory = bench.new("make", "stubborn")
+    (directory / "main.c").write_text(STUBBORN)
+    (directory / "app.yml").write_text(f"kind: make\nprogram: stubborn\narguments: ['{SAID}']\n")
+    bench.place(directory)
+    bench.do("stubborn", "start")
+    assert bench.wait_relays(on=True), "the program does not start"
+    bench.do("stubborn", "stop")
+    assert any(bench.relays.relays), "nothing resets them, and yet they are off"
+    (directory / "safe.yml").write_text(RELAYS)
+    bench.place(directory)
+    for _ in range(2):
+        bench.do("stubborn", "start")
+        assert bench.wait_relays(on=True), "the program does not start"
+        assert bench.do("stubborn", "stop") == "", "it measures nothing"
+        assert bench.wait_relays(on=False), "relays stay on after their program was ended"
+    assert bench.status("stubborn")["ActiveState"] == "failed"
+    log = bench.guest.shell.run(["sudo", "journalctl", "-o", "cat", "-u", "flotilla-app@stubborn"]).stdout
+    assert SAID in log.splitlines()
+
+
+def test_a_kept_app_starts_with_the_robot(bench: Bench) -> None:
+    """Power fails as soon as the command is done. An app that is not kept shows that the restart was one."""
+    with bench.connection() as to:
+        said = app_deploy.deploy(to, bench.new("block", "kept"), bench.board, keep=True, show=print)
+    assert "ActiveState=active" in said
+    bench.place(bench.new("block", "not-kept"))
+    bench.do("not-kept", "start")
+    bench.guest.machine.reset()
+    bench.guest.wait_booted()
+    after = bench.status("kept")
+    assert (after["ActiveState"], after["Kept"], after["NRestarts"]) == ("active", "yes", "0")
+    assert bench.status("not-kept")["ActiveState"] == "inactive"
+    assert measured(bench.do("kept", "stop"))[1] > 0
+
+
+def runs(bench: Bench, name: str) -> tuple[str, str]:
+    """Which version of an app runs, as which process."""
+    status = bench.status(name)
+    assert status["ActiveState"] == "active", status
+    return status["Version"], status["MainPID"]
+
+
+def test_what_does_not_compile_or_check_is_not_deployed(bench: Bench) -> None:
+    directory = bench.new("block", "broken")
+    bench.place(directory)
+    bench.do("broken", "start")
+    before = runs(bench, "broken")
+    source, task = directory / "broken.c", directory / "task.yml"
+    good = source.read_text()
+    source.write_text(good.replace("*phase +=", "*phaze +="))
+    with pytest.raises(UserError, match=r"(?s)nothing was deployed: .*broken\.c:\d+:\d+: error: .phaze. undeclared"):
+        bench.place(directory)
+    source.write_text(good)
+    task.write_text(task.read_text().replace("teeth.out", "teeth.aut"))
+    with pytest.raises(UserError, match=r"broken/task\.yml:\d+: block scaled: .*teeth\.aut"):
+        bench.place(directory)
+    source.write_text(good.replace('.name = "broken"', '.name = "gain"'))
+    with pytest.raises(UserError, match=r"broken\.so: block gain: another block has that name"):
+        bench.place(directory)
+    assert runs(bench, "broken") == before
+    bench.do("broken", "remove")
+
+
+def test_a_full_data_partition_refuses_and_leaves_the_last_good_app(bench: Bench) -> None:
+    directory = bench.new("block", "room")
+    bench.place(directory)
+    bench.do("room", "start")
+    before = runs(bench, "room")
+    task = directory / "task.yml"
+    task.write_text(task.read_text().replace("factor: 2", "factor: 3"))
+    shell = bench.guest.shell
+    fill = "fallocate -l $(($(df --output=avail -k /data | tail -n 1) - 3072))K /data/filler"
+    shell.run(["sudo", "sh", "-c", fill])
+    try:
+        with pytest.raises(UserError, match=r"robot4: /data has +\d+ KiB left, and the app needs \d+ KiB"):
+            bench.place(directory)
+        assert runs(bench, "room") == before
+    finally:
+        shell.run(["sudo", "rm", "/data/filler"])
+    bench.place(directory)
+    bench.do("room", "start")
+    assert runs(bench, "room") != before
+    assert shell.run(["sudo", "sh", "-c", "ls -d /data/apps/.room*"]).stdout.count("\n") == 1, "old versions stay"
+
+
+def test_a_board_that_is_another_one_is_refused(bench: Bench, fleet: Fleet) -> None:
+    with (
+        bench.connection() as to,
+        pytest.raises(UserError, match="it is an i686, but its board in the inventory is not"),
+    ):
+        app_deploy.deploy(to, bench.new("block", "other"), fleet.boards["x86_64"], keep=False, show=print)
+    with pytest.raises(UserError, match="there is no app other"):
+        bench.do("other", "start")
+
+
+def test_another_robots_card_is_refused(bench: Bench) -> None:
+    with bench.connection(3) as to, pytest.raises(UserError, match=r"robot3: refused, because its host key is not"):
+        app_deploy.command(to, "other", "status")
+
+
+def test_a_robot_that_is_not_there_is_said(bench: Bench) -> None:
+    with bench.connection(port=1) as to, pytest.raises(UserError, match=r"robot4 did not answer: .*refused"):
+        app_deploy.command(to, "other", "status")
+
+
+def test_nothing_stays_of_an_app_that_was_removed(bench: Bench) -> None:
+    with bench.connection() as to:
+        app_deploy.deploy(to, bench.new("make", "gone"), bench.board, keep=True, show=print)
+    shell = bench.guest.shell
+    left = ["sudo", "find", "/data", "-xdev", "-name", "*gone*", "-not", "-path", "/data/.work/*"]
+    assert "/data/apps/gone\n" in shell.run(left).stdout
+    assert bench.do("gone", "remove") == "gone is gone from robot4"
+    kept = [path for path in shell.run(left).stdout.splitlines() if not path.startswith("/data/etc/")]
+    assert kept == []
+    assert shell.run(["sudo", "find", "/etc/systemd/system", "-name", "*gone*"]).stdout == ""
+    with pytest.raises(UserError, match="there is no app gone"):
+        bench.do("gone", "stop")

@@ -1,0 +1,148 @@
+"""Apps: descriptions that are wrong, new ones from templates, what a robot is told and what its answers mean.
+
+Building one and running it is tested on a guest, in tests/test_deploy.py.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from images.builder import app, app_build, app_deploy, app_new, app_robot, paths
+from images.builder.errors import UserError
+from images.builder.fleet import Board, Robot
+
+ROBOT = Robot.model_validate({"name": "robot3", "number": 3, "address": "10.42.0.3", "board": "smartcoret3"})
+
+
+def write(directory: Path, text: str) -> Path:
+    """An app that has all files but for what its description lacks."""
+    directory.mkdir(exist_ok=True)
+    for name in ("task.yml", "Makefile"):
+        (directory / name).touch()
+    (directory / "app.yml").write_text(text)
+    return directory
+
+
+WRONG = {
+    "no YAML": ("kind: [", "while parsing a flow node"),
+    "no keys": ("block", "has no keys; at least kind: block|make|ert"),
+    "no kind": ("board: x86_64", "kind: (nothing): is missing; one of block, make, ert"),
+    "unknown kind": ("kind: blok", "kind: blok: is no kind of app; one of block, make, ert"),
+    "unknown key": ("kind: block\nprogram: x", "program: x: is no key of this kind of app; there are board, kind"),
+    "no program": ("kind: make", "program: (nothing): is missing; an app of kind make needs it"),
+    "program outside": ("kind: make\nprogram: ../x", "program: ../x: is not a file inside the app; such as hover"),
+    "absolute program": ("kind: make\nprogram: /bin/sh", "program: /bin/sh: is not a file inside the app"),
+    "a number": ("kind: make\nprogram: 5", "program: 5: is wrong; Input should be a valid string"),
+    "a number in a list": ("kind: make\nprogram: x\narguments: [a, 7]", "arguments.1: 7: is wrong; Input should be"),
+}
+
+
+@pytest.mark.parametrize(("text", "said"), WRONG.values(), ids=WRONG.keys())
+def test_a_wrong_description_is_refused_with_key_and_remedy(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(UserError) as refused:
+        app.load(write(tmp_path / "hover", text))
+    assert f"hover/app.yml: {said}" in str(refused.value)
+
+
+def test_what_an_app_lacks_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"hover/app\.yml is missing; `make new-app"):
+        app.load(tmp_path / "hover")
+    for kind, file in (("block", "task.yml"), ("make\nprogram: x", "Makefile")):
+        directory = write(tmp_path / "hover", f"kind: {kind}")
+        (directory / file).unlink()
+        with pytest.raises(UserError, match=f"hover/{file} is missing"):
+            app.load(directory)
+
+
+@pytest.mark.parametrize("name", ["Hover", "3d", "a_b", "", "a/b", "a.b", "x" * 33, "a@b", "hover\n"])
+def test_names_that_no_unit_could_have(name: str) -> None:
+    with pytest.raises(UserError, match="is not an app's name"):
+        app.check_name(name)
+
+
+def test_an_app_for_another_board(tmp_path: Path) -> None:
+    board = Board.model_construct(name="smartcoret3")
+    app.check_board(app.load(write(tmp_path / "hover", "kind: block\nboard: smartcoret3")), ROBOT, board)
+    with pytest.raises(UserError, match="board: x86_64: robot3 is a smartcoret3; choose a robot of that board"):
+        app.check_board(app.load(write(tmp_path / "hover", "kind: block\nboard: x86_64")), ROBOT, board)
+
+
+@pytest.mark.parametrize("kind", app.KINDS)
+def test_a_new_app_is_one(tmp_path: Path, kind: str) -> None:
+    app_new.create(kind, "my-app", tmp_path)
+    made = app.load(tmp_path / "my-app")
+    assert (made.name, made.description.kind) == ("my-app", kind)
+    assert not list(tmp_path.glob(".*")), "something is left beside it"
+    with pytest.raises(UserError, match="my-app is there already"):
+        app_new.create(kind, "my-app", tmp_path)
+
+
+def test_a_new_app_of_no_kind(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"KIND=blok: is no kind of app; one of block, make, ert"):
+        app_new.create("blok", "hover", tmp_path)
+
+
+def test_the_new_apps_compile_without_a_warning(tmp_path: Path) -> None:
+    """With this computer's compiler; tests/test_deploy.py takes the locked one."""
+    for kind in app.KINDS:
+        app_new.create(kind, f"my-{kind}", tmp_path)
+    include = paths.PROJECT / "runtime" / "include"
+    warnings = ["-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-fsyntax-only"]
+    block = ["cc", "-std=c11", *warnings, f"-I{include}", str(tmp_path / "my-block" / "my_block.c")]
+    subprocess.run(block, check=True)
+    subprocess.run(["cc", "-std=gnu11", *warnings, str(tmp_path / "my-make" / "main.c")], check=True)
+
+
+def test_a_programs_service(tmp_path: Path) -> None:
+    """Quoted as systemd.service(5) says: seen to fail without the doubled percent sign."""
+    text = "kind: make\nprogram: build/hover\narguments: ['50 %', '$HOME', 'a\"b\\c']\n"
+    made = app.load(write(tmp_path / "hover", text))
+    assert isinstance(made.description, app.Make)
+    service = app_build.service(made, made.description, safe=True)
+    assert r'ExecStart="/data/apps/hover/hover" "50 %%" "$$HOME" "a\"b\\c"' in service.splitlines()
+    assert "ExecStopPost=/usr/bin/flotilla-run --safe /data/apps/hover/safe.yml" in service.splitlines()
+    assert "WatchdogSec=0" in service.splitlines()
+    watched = app_build.service(made, made.description.model_copy(update={"notify": True}), safe=False)
+    assert "WatchdogSec" not in watched
+    assert "--safe" not in watched
+
+
+TIMES = {"count": 100, "min_ns": 1000, "mean_ns": 2500, "p99_ns": 80000, "max_ns": 91250}
+
+
+def test_the_report() -> None:
+    counted = {"period_ns": 10_000_000, "steps": 100, "overruns": 2, "skipped": 3}
+    lines = app_robot.summary({**counted, "jitter": TIMES, "step": TIMES, "blocks": {"a": TIMES}})
+    assert lines == [
+        "period 10 ms, 100 steps, 2 overruns, 3 skipped",
+        "jitter: mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
+        "step:   mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
+        "  a: mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
+    ]
+
+
+SAID = {
+    "host key": (255, "Host key verification failed.", "refused, because its host key is not the one of"),
+    "away": (255, "connect to host 10.42.0.3 port 22: No route to host", "did not answer: connect to host"),
+    "broken": (255, "", "did not answer: the connection broke; is it on and reachable? `make ssh ROBOT=3`"),
+    "refusal": (3, "/data has 12 KiB left\n", "robot3: /data has 12 KiB left"),
+    "silent": (1, "", "robot3: status 1"),
+}
+
+
+@pytest.mark.parametrize(("status", "stderr", "said"), SAID.values(), ids=SAID.keys())
+def test_what_goes_wrong_on_the_way_is_said(tmp_path: Path, status: int, stderr: str, said: str) -> None:
+    script = tmp_path / "ssh"
+    script.write_text(f"#!/bin/sh\nprintf '%s' '{stderr}' >&2\nexit {status}\n")
+    script.chmod(0o755)
+    with app_robot.connection(ROBOT, [str(script)]) as to, pytest.raises(UserError) as refused:
+        app_deploy.command(to, "hover", "status")
+    assert said in str(refused.value)
+
+
+def test_an_unknown_run() -> None:
+    with pytest.raises(UserError, match="RUN=restart: is none of start, stop, status, log, remove"):
+        app_deploy.command(app_robot.Connection(ROBOT, ["false"]), "hover", "restart")
