@@ -85,7 +85,7 @@ static int add_port(struct fl_block *block, struct fl_port **ports, uint32_t *co
     struct fl_port *more = fl_allocate(block, sizeof port * (*count + 1));
     if (!more)
         return FL_FAILED;
-    if (*count)
+    if (*ports)
         memcpy(more, *ports, sizeof port * *count);
     more[(*count)++] = port;
     *ports = more;

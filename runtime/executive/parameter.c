@@ -236,7 +236,8 @@ static void write_real(double value, FILE *out)
     char text[32];
     for (int digits = 15; digits <= 17; digits++) {
         snprintf(text, sizeof text, "%.*g", digits, value);
-        if (memcmp(&(double){strtod(text, NULL)}, &value, sizeof value) == 0)
+        double read = strtod(text, NULL);
+        if (!(read < value) && !(read > value))
             break;
     }
     fputs(text, out);

@@ -283,10 +283,8 @@ static void serve_client(struct tuner *tuner, struct client *client)
         fflush(client->answer);
         if (done && setting)
             fprintf(stderr, "flotilla: %s: user %u: %s", tuner->task->name, (unsigned)client->user, text + 3);
-        if (!done) {
-            rewind(client->answer);
+        if (!done && fseek(client->answer, 0, SEEK_SET) == 0)
             fprintf(client->answer, "error\n%s\n", client->reason);
-        }
         fflush(client->answer);
         send_all(tuner, client, text, length);
     }
