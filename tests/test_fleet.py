@@ -148,6 +148,8 @@ def test_drift_is_shown_mended_and_gone(guests: Guests) -> None:
     planted = [(name, *drift) for table in (DRIFT, MORE_DRIFT) for name, drift in table.items()]
     for name, script, _ in planted:
         guests.sudo(name, script)
+    of_an_app = "/etc/systemd/system/flotilla-app@some.service.d"
+    guests.sudo("robot4", f"ln -s /data/apps/some/unit.d {of_an_app}")
     shown = guests.play("--check", "--diff", *AT_ONCE)
     assert shown.status == 0, shown.said
     assert shown.outcomes() == dict.fromkeys(guests.robots, "would change")
@@ -162,6 +164,7 @@ def test_drift_is_shown_mended_and_gone(guests: Guests) -> None:
     again = guests.play(*AT_ONCE)
     assert again.outcomes() == dict.fromkeys(guests.robots, "up to date"), again.report
     assert "kp: 0.3" in guests.sudo("robot1", "cat /etc/flotilla/tasks/heading.yml")
+    guests.sudo("robot4", f"rm {of_an_app}")
 
 
 def test_a_robot_that_dies_stops_the_roll_out_and_nothing_is_half_done(guests: Guests) -> None:

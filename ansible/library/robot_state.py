@@ -10,6 +10,7 @@ seconds; this whole module takes it two or three.
 
 from __future__ import annotations
 
+import fnmatch
 import glob
 import hashlib
 import json
@@ -132,7 +133,8 @@ def drift(expected: dict[str, dict[str, Any]], keep: list[str]) -> list[dict[str
         elif there.mode != wanted["mode"] or there.owner != (0, 0):
             add(path, "write", f"has mode {there.mode:o} and owner {there.owner[0]}", there)
     layer = [path[len(LAYER) - len("/etc") :] for path in below(LAYER)]
-    others = sorted(path for path in layer if path not in expected and path not in keep)
+    kept = {path for pattern in keep for path in fnmatch.filter(layer, pattern)}
+    others = sorted(path for path in layer if path not in expected and path not in kept)
     hidden = [place[len(LAYER) - len("/etc") :] for place, _, _ in os.walk(LAYER) if is_opaque(place)]
     if not others and not hidden:
         return found
@@ -183,7 +185,8 @@ def units(tasks: list[str]) -> dict[str, dict[str, str]]:
     wanted = glob.glob("/etc/systemd/system/*.wants/*.service")
     names = sorted({os.path.basename(path) for path in wanted if os.path.exists(path)})
     names = [name for name in names if "@." not in name] + [f"flotilla-task@{task}.service" for task in tasks]
-    running = output("systemctl", "list-units", "--plain", "--no-legend", "--all", "flotilla-*@*.service")
+    instances = "flotilla-task@*.service", "flotilla-ibss@*.service"
+    running = output("systemctl", "list-units", "--plain", "--no-legend", "--all", *instances)
     names += [line.split()[0] for line in running.splitlines() if line.split()[0] not in names]
     blocks = output("systemctl", "show", "--property", UNIT_PROPERTIES, *names).strip().split("\n\n")
     shown = (dict(line.split("=", 1) for line in block.splitlines()) for block in blocks)

@@ -16,8 +16,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[3]))  # the project
 from images.builder import provision
 from images.builder.errors import UserError
 
-KEEP = ["/etc/mtab"]  # made by systemd at boot
-"""What a robot writes into its layer of /etc by itself."""
+KEEP = [
+    "/etc/mtab",  # made by systemd at boot
+    "/etc/systemd/system/flotilla-app@*",  # made by `make deploy`
+    "/etc/systemd/system/multi-user.target.wants/flotilla-app@*",  # with KEEP=1
+]
+"""What a robot has in its layer of /etc besides, as shell patterns."""
 MACHINES = {"i386": "i686", "amd64": "x86_64"}
 """What the kernel calls the processor, by Debian's architecture."""
 TASK = "flotilla-task@"
