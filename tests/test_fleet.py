@@ -211,7 +211,6 @@ def test_a_wrong_netmask_leaves_the_robot_at_its_old_address(guests: Guests, tmp
     done = guests.play("-l", "robot4", "-e", "network_trial_s=50", inventory=inventory)
     assert done.outcomes() == {"robot4": "failed"}
     assert "does not answer at 10.42.0.4/29" in done.said
-    guests.shells["robot4"].close()
     guests.shells["robot4"].connect(120)
     assert guests.sudo("robot4", "find /data/etc -type f | sort | xargs sha256sum") == before
     assert guests.play("-l", "robot4").outcomes() == {"robot4": "up to date"}
@@ -283,7 +282,6 @@ def test_robots_restart_and_are_healthy(guests: Guests) -> None:
     before = guests.sudo("robot4", "cat /proc/sys/kernel/random/boot_id")
     done = guests.play("-l", "robot4", playbook="reboot")
     assert done.status == 0, done.said
-    guests.shells["robot4"].close()
     guests.shells["robot4"].connect()
     assert guests.sudo("robot4", "cat /proc/sys/kernel/random/boot_id") != before
 
