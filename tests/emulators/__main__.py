@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import signal
 import threading
 from pathlib import Path
 
@@ -44,6 +45,7 @@ def main() -> None:
     options = parser.parse_args()
     faults = Faults(options.garbage, options.half, options.corrupt, options.silence, options.burst, options.baud)
     endpoint = Stream(options.connect) if options.connect else Pty(options.link)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
     with SerialLine(device(options), endpoint, faults=faults, seed=options.seed) as line:
         print(line.path, flush=True)
         try:

@@ -388,7 +388,10 @@ def test_program_prints_the_path_and_plugs_out(tmp_path: Path) -> None:
         assert robot.read_until(lambda heard: heard.count(b"\r\n") > 2).split(b"\r\n")[1].split()[1] == b"1"
         robot.close()
         program.send_signal(signal.SIGINT)
-        assert program.wait(TIMEOUT) == 0
+        try:
+            assert program.wait(TIMEOUT) == 0
+        finally:
+            program.kill()
     assert not link.exists()
 
 
