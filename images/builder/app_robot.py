@@ -202,8 +202,8 @@ def summary(statistics: dict[str, Any]) -> list[str]:
     """What flotilla-run's statistics say about real time, a line each."""
 
     def times(what: dict[str, Any]) -> str:
-        mean, most, largest = (what[key] / 1000 for key in ("mean_ns", "p99_ns", "max_ns"))
-        return f"mean {mean:.1f} µs, 99 % {most:.1f} µs, max {largest:.1f} µs"
+        words = (("mean", "mean_ns"), ("99 %", "p99_ns"), ("max", "max_ns"))  # blocks have no percentiles
+        return ", ".join(f"{word} {what[key] / 1000:.1f} µs" for word, key in words if key in what)
 
     return [
         f"period {statistics['period_ns'] / 1e6:g} ms, {statistics['steps']} steps, "

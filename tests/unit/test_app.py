@@ -115,12 +115,13 @@ TIMES = {"count": 100, "min_ns": 1000, "mean_ns": 2500, "p99_ns": 80000, "max_ns
 
 def test_the_report() -> None:
     counted = {"period_ns": 10_000_000, "steps": 100, "overruns": 2, "skipped": 3}
-    lines = app_robot.summary({**counted, "jitter": TIMES, "step": TIMES, "blocks": {"a": TIMES}})
+    block = {"count": 100, "mean_ns": 2500, "max_ns": 91250}
+    lines = app_robot.summary({**counted, "jitter": TIMES, "step": TIMES, "blocks": {"a": block}})
     assert lines == [
         "period 10 ms, 100 steps, 2 overruns, 3 skipped",
         "jitter: mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
         "step:   mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
-        "  a: mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
+        "  a: mean 2.5 µs, max 91.2 µs",
     ]
 
 
