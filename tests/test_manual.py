@@ -23,6 +23,16 @@ ELSEWHERE = {
     "make flash ROBOT=3 DEV=/dev/sdX": "needs a card; into a file below, on block devices in unit/test_flash.py",
     "sudo ip address add 10.42.0.254/24 dev eth0": "changes this computer's network",
     "ping 10.42.0.3": "needs the robot",
+    **dict.fromkeys(
+        (
+            'make provision ARGS="--check --diff"',
+            "make provision",
+            'make provision PLAYBOOK=tasks ARGS="-e do=stop -e task=heading"',
+            "make provision PLAYBOOK=collect",
+            "make provision PLAYBOOK=reboot",
+        ),
+        "needs the robots; test_fleet.py plays the same on guests",
+    ),
     "build/venv/bin/python -m serial.tools.miniterm /dev/ttyUSB0 115200": "needs a cable",
 }
 """Commands that need hardware or a terminal, with who does the like."""
