@@ -96,6 +96,7 @@ class Guests:
 ENVIRONMENT = os.environ | {
     "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
     "ANSIBLE_NOCOLOR": "1",
+    "BUILD": str(paths.BUILD),
     "KEYS": str(paths.KEYS),
 }
 AT_ONCE = ("-e", json.dumps({"waves": ["100%"]}))
