@@ -100,6 +100,19 @@ REFUSED = {
         "1: task: phase is not below the period",
     ),
     "phase without unit": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\nphase: 0"), "2: phase: 0 is not a time"),
+    "trigger": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\ntrigger: b"), "2: trigger: there is no block b"),
+    "trigger that waits for nothing": (
+        task("a: {type: gain, in: {in: 1}}", "period: 1 ms\ntrigger: a"),
+        "2: trigger: a, a gain, waits for nothing; one that does is udp-receive",
+    ),
+    "trigger with a phase": (
+        task("a: {type: udp-receive, parameters: {port: 9, length: 1}}", "period: 2 ms\nphase: 1 ms\ntrigger: a"),
+        "3: trigger: a step that is due when something comes has no phase",
+    ),
+    "trigger now and then": (
+        task("a: {type: udp-receive, every: 2, parameters: {port: 9, length: 1}}", "period: 1 ms\ntrigger: a"),
+        "4: block a: the trigger runs in every step",
+    ),
     "priority": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 99"), "2: priority: 99 is not a whole"),
     "priority 1": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 1"), "priority: 1 leaves none below"),
     "policy": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\noverrun: ignore"), "2: overrun: ignore is none of"),
@@ -333,7 +346,7 @@ def test_a_plugin_of_another_interface_is_refused(tasks: Tasks, tmp_path: Path) 
     compile_shared(PLUGIN / "misbehave.c", tmp_path / "old.so", f"-I{HEADERS}", "-DMISBEHAVE_ABI=999")
     older = Tasks(tasks.program, tmp_path, tmp_path)
     lines = older.refusal(task("a: {type: misbehave, parameters: {manner: fail}}"))
-    assert "made for interface 999 of blocks, this is 1; build it anew" in lines[0]
+    assert "made for interface 999 of blocks, this is 2; build it anew" in lines[0]
     assert "there is no block misbehave" in lines[-1]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -171,6 +172,43 @@ def test_udp_of_another_length_is_refused(start: Start) -> None:
     ):
         row = receiver.until(lambda row: row["refused"] >= 5)
         assert (row["flag"], row["sequence"]) == (0, 0)
+
+
+TRIGGERED = """
+period: 400 ms
+trigger: udp
+blocks:
+  udp: {{type: udp-receive, parameters: {{port: {port}, length: 4, timeout: 0.3}}}}
+"""
+
+
+def test_a_datagram_triggers_a_step_and_silence_does(start: Start, tmp_path: Path) -> None:
+    """One datagram, one step; what is refused is none; what does not come is a step all the same.
+
+    Seen to fail with `trigger` left out of the task, and with an `await` that returns for a datagram that is refused.
+    """
+    port, statistics = free_port(), tmp_path / "statistics.json"
+    options = ("--watch", RECEIVED, "--statistics", str(statistics))
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        start("triggered", TRIGGERED.format(port=port), *options) as task,
+    ):
+        sender.connect(("127.0.0.1", port))
+        rows = task.rows()
+        next(rows)  # the port is open; nothing has come yet
+        for number in range(5):
+            sender.send(bytes([0, 0, 0, number]))
+            row = next(row for row in rows if row["sequence"] > number)
+            assert (row["sequence"], row["data"][3], row["flag"]) == (number + 1, number, 1)
+        for _ in range(50):
+            sender.send(b"no")
+        row = next(row for row in rows if row["refused"] == 50)
+        row = next(row for row in rows if row["flag"] == 0)
+        assert row["sequence"] == 5
+        assert task.end() == 0
+    counted = json.loads(statistics.read_text())
+    assert counted["steps"] - counted["timeouts"] == 5
+    assert counted["timeouts"] >= 2
 
 
 def test_a_port_is_for_one(start: Start, refusal: Callable[..., tuple[int, str]]) -> None:

@@ -7,7 +7,10 @@
 #include <pthread.h>
 #include <string.h>
 #include <sys/eventfd.h>
+#include <time.h>
 #include <unistd.h>
+
+#define SECOND_NS INT64_C(1000000000)
 
 struct fl_driver {
     pthread_t thread;
@@ -67,4 +70,15 @@ int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int ti
     if (waiting[1].revents & (POLLIN | POLLOUT))
         return 1;
     return waiting[1].revents ? -2 : 0;
+}
+
+bool fl_await_readable(int fd, int64_t until_ns)
+{
+    struct pollfd waiting = {.fd = fd, .events = POLLIN};
+    for (int64_t left_ns; (left_ns = until_ns - fl_now_ns()) > 0;) {
+        const struct timespec timeout = {(time_t)(left_ns / SECOND_NS), (long)(left_ns % SECOND_NS)};
+        if (ppoll(&waiting, 1, &timeout, NULL) > 0)
+            return true;
+    }
+    return false;
 }

@@ -34,6 +34,7 @@ struct executive {
     struct schedule *schedule;
     struct watch *watch;   /* NULL: nothing is printed */
     struct change *change; /* NULL: parameters stay as they are */
+    pthread_t control;
     int ended_fd;
     _Atomic bool stop, ended;
     _Atomic uint64_t heartbeat; /* steps done, for the watching thread */
@@ -122,15 +123,44 @@ static void sleep_until(int64_t release_ns)
         continue;
 }
 
-/* When the step after one that was released at `release_ns` and ended at `now_ns` is due. */
-static int64_t next_release(struct executive *executive, int64_t release_ns, int64_t now_ns, int64_t *in_a_row)
+/* Wait until a step is due; when it was. `expected_ns`: when it should be, which what triggers it moves.
+ *
+ * A trigger may come half a period early or late. Nothing for longer is a step without it, so that there are as many
+ * steps as periods and blocks notice the silence; something sooner waits, so that a flood cannot be a flood of steps.
+ */
+static int64_t wait_for_release(struct executive *executive, int64_t *expected_ns)
+{
+    struct fl_block *trigger = executive->task->trigger;
+    const int64_t half_ns = executive->task->period_ns / 2;
+    if (executive->options->no_wait)
+        return *expected_ns;
+    if (!trigger) {
+        sleep_until(*expected_ns);
+        return *expected_ns;
+    }
+    const int64_t earliest_ns = *expected_ns - half_ns, latest_ns = *expected_ns + half_ns;
+    sleep_until(earliest_ns);
+    int64_t came_ns = trigger->type->await(trigger, latest_ns);
+    if (!came_ns) {
+        executive->result->timeouts++;
+        return latest_ns;
+    }
+    *expected_ns = came_ns > earliest_ns ? came_ns : earliest_ns;
+    return *expected_ns;
+}
+
+/* When the step is expected after one that was expected at `expected_ns`, due at `release_ns`, and ended at `now_ns`.
+ */
+static int64_t next_release(struct executive *executive, int64_t expected_ns, int64_t release_ns, int64_t now_ns,
+                            int64_t *in_a_row)
 {
     const struct task *task = executive->task;
     struct run_result *result = executive->result;
     int64_t next_ns = release_ns + task->period_ns;
+    expected_ns += task->period_ns;
     if (executive->options->no_wait || now_ns <= next_ns) {
         *in_a_row = 0;
-        return next_ns;
+        return expected_ns;
     }
     char text[128];
     result->overruns++;
@@ -143,9 +173,9 @@ static int64_t next_release(struct executive *executive, int64_t release_ns, int
     }
     int64_t behind = (now_ns - next_ns) / task->period_ns + 1;
     if (task->overrun == OVERRUN_CATCH_UP && behind <= CATCH_UP_PERIODS)
-        return next_ns;
+        return expected_ns;
     result->skipped += (uint64_t)behind;
-    return next_ns + behind * task->period_ns;
+    return expected_ns + behind * task->period_ns;
 }
 
 static void *control(void *argument)
@@ -156,10 +186,9 @@ static void *control(void *argument)
     int64_t in_a_row = 0, period_ns = executive->task->period_ns;
     touch_stack();
     /* By multiples of the period, so that tasks of one computer keep their phases to each other. */
-    int64_t release_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
+    int64_t expected_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
     while (!atomic_load_explicit(&executive->stop, memory_order_relaxed)) {
-        if (!options->no_wait)
-            sleep_until(release_ns);
+        int64_t release_ns = wait_for_release(executive, &expected_ns);
         int64_t begin_ns = fl_now_ns();
         if (!options->no_wait)
             statistics_add(&result->jitter, begin_ns - release_ns);
@@ -178,7 +207,7 @@ static void *control(void *argument)
             change_take(executive->change, result->steps);
         if (result->steps == options->steps)
             end(result, ENDING_ASKED, NULL, "all steps are done");
-        release_ns = next_release(executive, release_ns, now_ns, &in_a_row);
+        expected_ns = next_release(executive, expected_ns, release_ns, now_ns, &in_a_row);
         if (result->ending != ENDING_NONE)
             break;
     }
@@ -188,14 +217,49 @@ static void *control(void *argument)
     return NULL;
 }
 
-/* --- watching thread --- */
+/* --- guarding thread --- */
+
+/* A step that never ends: outputs to their reset state from here, and leave the thread where it is. */
+static void abandon(struct executive *executive)
+{
+    char text[128];
+    snprintf(text, sizeof text, "no step for ten periods and a second, after step %" PRIu64,
+             atomic_load(&executive->heartbeat));
+    make_outputs_safe(executive->task);
+    /* Others have to run for what follows, and the thread may be all that does. */
+    pthread_setschedparam(executive->control, SCHED_OTHER, &(struct sched_param){0});
+    fprintf(stderr, "flotilla: %s: %s; outputs are in their reset state\n", executive->task->name, text);
+    fflush(NULL);
+    _exit(1);
+}
 
 /* Until the control thread has ended, or cannot. */
-static void supervise(struct executive *executive, int signals_fd)
+static void *guard(void *argument)
+{
+    struct executive *executive = argument;
+    uint64_t steps, last = 0;
+    int64_t now_ns, moved_ns = fl_now_ns();
+    const int64_t patience_ns = 10 * executive->task->period_ns + SECOND_NS;
+    struct pollfd ended = {.fd = executive->ended_fd, .events = POLLIN};
+    while (poll(&ended, 1, (int)(patience_ns / 2 / 1000000)) <= 0) {
+        now_ns = fl_now_ns();
+        steps = atomic_load_explicit(&executive->heartbeat, memory_order_acquire);
+        if (steps != last)
+            moved_ns = now_ns;
+        last = steps;
+        if (now_ns - moved_ns > patience_ns)
+            abandon(executive);
+    }
+    return NULL;
+}
+
+/* --- serving thread --- */
+
+/* Until the control thread has ended. */
+static void serve(struct executive *executive, int signals_fd)
 {
     uint64_t usec = 0, last = 0;
     int64_t period_ns = executive->task->period_ns, moved_ns = fl_now_ns(), notified_ns = 0;
-    int64_t patience_ns = 10 * period_ns + SECOND_NS;
     bool guarded = sd_watchdog_enabled(0, &usec) > 0;
     int64_t interval_ns = guarded ? (int64_t)usec * 1000 / 4 : SECOND_NS;
     int64_t wake_ms = executive->watch ? WATCH_MS : interval_ns / 1000000;
@@ -211,18 +275,14 @@ static void supervise(struct executive *executive, int signals_fd)
         }
         int64_t now_ns = fl_now_ns();
         uint64_t steps = atomic_load_explicit(&executive->heartbeat, memory_order_acquire);
-        if (steps != last || period_ns > now_ns - moved_ns) {
-            /* Only a task that steps may say that it is alive. */
-            if (guarded && now_ns - notified_ns >= interval_ns) {
-                sd_notify(0, "WATCHDOG=1");
-                notified_ns = now_ns;
-            }
+        /* Only a task that steps may say that it is alive. */
+        if (guarded && (steps != last || period_ns > now_ns - moved_ns) && now_ns - notified_ns >= interval_ns) {
+            sd_notify(0, "WATCHDOG=1");
+            notified_ns = now_ns;
         }
         if (steps != last)
             moved_ns = now_ns;
         last = steps;
-        if (now_ns - moved_ns > patience_ns)
-            return;
     }
 }
 
@@ -237,18 +297,6 @@ static int block_signals(void)
     return signalfd(-1, &signals, SFD_CLOEXEC);
 }
 
-/* Neither stop nor end by itself: outputs to their reset state from here, and leave the thread where it is. */
-static void abandon(struct executive *executive)
-{
-    char text[128];
-    snprintf(text, sizeof text, "no step for ten periods and a second, after step %" PRIu64,
-             atomic_load(&executive->heartbeat));
-    make_outputs_safe(executive->task);
-    fprintf(stderr, "flotilla: %s: %s; outputs are in their reset state\n", executive->task->name, text);
-    fflush(NULL);
-    _exit(1);
-}
-
 static void serve_parameters(const struct executive *executive)
 {
     int error = executive->options->tuner ? tuner_start(executive->options->tuner) : 0;
@@ -257,9 +305,26 @@ static void serve_parameters(const struct executive *executive)
                 strerror(error));
 }
 
+/* The threads that step and guard; 0 or an errno. Signals that ask for the end are blocked in both. */
+static int start_threads(struct executive *executive, int priority, pthread_t *guarding)
+{
+    struct fl_service stepping = {.priority = priority};
+    struct fl_service above = {
+        .priority = priority ? privilege_priority(priority + 1, "a step that never ends keeps its processor") : 0};
+    int error = fl_service_thread(&stepping, &executive->control, executive->task->name, control, executive);
+    if (error)
+        return error;
+    error = fl_service_thread(&above, guarding, "guard", guard, executive);
+    if (error) {
+        atomic_store(&executive->stop, true);
+        pthread_join(executive->control, NULL);
+    }
+    return error;
+}
+
 void executive_run(struct task *task, const struct run_options *options, struct run_result *result)
 {
-    pthread_t thread;
+    pthread_t guarding;
     struct executive executive = {.task = task, .options = options, .result = result};
     *result = (struct run_result){0};
     int signals_fd = block_signals();
@@ -270,22 +335,20 @@ void executive_run(struct task *task, const struct run_options *options, struct 
     executive.change = options->tuner ? tuner_change(options->tuner) : NULL;
     if (!options->no_wait)
         privilege_lock_memory();
-    int priority = options->no_wait ? 0 : privilege_priority(task->priority);
+    int priority = options->no_wait ? 0 : privilege_priority(task->priority, "steps will be late under load");
     for (size_t i = 0; i < task->count; i++)
         task->members[i].block->service->priority = priority ? priority - 1 : 0;
     if (start_blocks(task, result)) {
-        struct fl_service service = {.priority = priority};
-        int error = fl_service_thread(&service, &thread, task->name, control, &executive);
+        int error = start_threads(&executive, priority, &guarding);
         if (error) {
             end(result, ENDING_FAILED, NULL, strerror(error));
         } else {
             serve_parameters(&executive);
             sd_notify(0, "READY=1");
-            supervise(&executive, signals_fd);
-            if (!atomic_load(&executive.ended))
-                abandon(&executive);
+            serve(&executive, signals_fd);
             sd_notify(0, "STOPPING=1");
-            pthread_join(thread, NULL);
+            pthread_join(executive.control, NULL);
+            pthread_join(guarding, NULL);
             if (options->tuner)
                 tuner_stop(options->tuner);
             if (executive.watch)
@@ -305,8 +368,8 @@ void executive_write_statistics(const struct task *task, const struct run_result
 {
     fprintf(out, "{\"task\": \"%s\", \"period_ns\": %" PRId64 ", \"steps\": %" PRIu64, task->name, task->period_ns,
             result->steps);
-    fprintf(out, ", \"overruns\": %" PRIu64 ", \"skipped\": %" PRIu64 ",\n \"jitter\": ", result->overruns,
-            result->skipped);
+    fprintf(out, ", \"overruns\": %" PRIu64 ", \"skipped\": %" PRIu64 ", \"timeouts\": %" PRIu64 ",\n \"jitter\": ",
+            result->overruns, result->skipped, result->timeouts);
     statistics_write(&result->jitter, out);
     fprintf(out, ",\n \"step\": ");
     statistics_write(&result->step, out);

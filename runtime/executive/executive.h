@@ -1,8 +1,9 @@
 /* Runs a task: start and initialize all blocks, step them in real time, leave outputs in their reset state.
  *
- * The steps run in a thread of their own (SCHED_FIFO at the task's priority), released at absolute times. The caller's
- * thread watches: signals, the service manager's watchdog, what is to be printed. It never waits for the control
- * thread without a bound, so a task cannot hang.
+ * The steps run in a thread of their own (SCHED_FIFO at the task's priority), released at absolute times or by the
+ * task's trigger. The caller's thread serves: signals, the service manager's watchdog, what is to be printed. Another
+ * guards the control thread, one priority above it, so that a step that never ends neither keeps outputs as they are
+ * nor a computer with one processor to itself: a task cannot hang.
  */
 #ifndef FLOTILLA_EXECUTIVE_H
 #define FLOTILLA_EXECUTIVE_H
@@ -19,7 +20,6 @@ enum ending {
     ENDING_ASKED,   /* a signal, or all steps done */
     ENDING_FAILED,  /* a block's start, initialize or step */
     ENDING_OVERRUN, /* overrun policy stop-safe, or too many in a row */
-    ENDING_HUNG,    /* the control thread made no step for ten periods and a second */
 };
 
 struct watched {
@@ -40,9 +40,11 @@ struct run_options {
 struct run_result {
     enum ending ending;
     char reason[320];
-    uint64_t steps, overruns, skipped; /* skipped: releases that were left out */
-    struct statistics jitter;          /* from a step's release to its begin */
-    struct statistics step;            /* from begin to end */
+    uint64_t steps, overruns;
+    uint64_t skipped;         /* releases that were left out */
+    uint64_t timeouts;        /* steps for which the trigger had nothing */
+    struct statistics jitter; /* from a step's release to its begin */
+    struct statistics step;   /* from begin to end */
 };
 
 /* Run until it ends; the blocks are terminated and the result is complete then. Messages go to stderr. */

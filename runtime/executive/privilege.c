@@ -16,17 +16,15 @@ void privilege_lock_memory(void)
             strerror(errno));
 }
 
-int privilege_priority(int priority)
+int privilege_priority(int priority, const char *consequence)
 {
     struct sched_param before, wanted = {.sched_priority = priority};
     if (!priority)
         return 0;
     int policy = sched_getscheduler(0);
     if (sched_getparam(0, &before) < 0 || sched_setscheduler(0, SCHED_FIFO, &wanted) < 0) {
-        fprintf(
-            stderr,
-            "flotilla: SCHED_FIFO %d is refused (%s; CAP_SYS_NICE or LimitRTPRIO=): steps will be late under load\n",
-            priority, strerror(errno));
+        fprintf(stderr, "flotilla: SCHED_FIFO %d is refused (%s; CAP_SYS_NICE or LimitRTPRIO=): %s\n", priority,
+                strerror(errno), consequence);
         return 0;
     }
     sched_setscheduler(0, policy, &before);

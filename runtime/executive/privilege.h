@@ -6,7 +6,7 @@
 /* Keep all memory, present and future, in RAM. */
 void privilege_lock_memory(void);
 
-/* `priority` where SCHED_FIFO is allowed, otherwise 0. */
-int privilege_priority(int priority);
+/* `priority` where SCHED_FIFO is allowed, otherwise 0 after saying the consequence. */
+int privilege_priority(int priority, const char *consequence);
 
 #endif

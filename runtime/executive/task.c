@@ -353,6 +353,29 @@ static void order(struct building *building)
     task->members = ordered;
 }
 
+/* --- trigger --- */
+
+static void find_trigger(struct building *building)
+{
+    const struct task_file *file = building->file;
+    struct task *task = building->task;
+    for (size_t i = 0; file->trigger && i < task->count && !task->trigger; i++)
+        if (strcmp(task->members[i].block->name, file->trigger) == 0)
+            task->trigger = task->members[i].block;
+    if (!file->trigger)
+        return;
+    if (!task->trigger)
+        problem(building->problems, file->trigger_line, "trigger: there is no block %s", file->trigger);
+    else if (!task->trigger->type->await)
+        problem(building->problems, file->trigger_line,
+                "trigger: %s, a %s, waits for nothing; one that does is udp-receive", file->trigger,
+                task->trigger->type->name);
+    for (size_t i = 0; i < file->count; i++)
+        if (strcmp(file->blocks[i].name, file->trigger) == 0 && file->blocks[i].every > 1)
+            problem(building->problems, file->blocks[i].line, "block %s: the trigger runs in every step",
+                    file->trigger);
+}
+
 /* --- all of it --- */
 
 static char *name_of(const char *path)
@@ -385,6 +408,7 @@ void task_build(struct task *task, struct registry *registry, struct problems *p
         for (size_t i = 0; i < file.count; i++)
             wire_block(&building, i, &file.blocks[i]);
         check_devices(&building);
+        find_trigger(&building);
         if (!problems->count)
             order(&building);
     }

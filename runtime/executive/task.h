@@ -23,7 +23,8 @@ struct task {
     int64_t period_ns, phase_ns, overruns;
     int priority;
     enum overrun overrun;
-    struct member *members; /* in the order of execution */
+    struct fl_block *trigger; /* steps are due when it has something new; NULL: by the clock */
+    struct member *members;   /* in the order of execution */
     size_t count;
 };
 

@@ -243,6 +243,14 @@ static void read_phase(struct reading *reading, const yaml_node_t *value)
         problem(reading->problems, line_of(value), "phase: %s is not a time such as 5 ms", text ? text : "a list");
 }
 
+static void read_trigger(struct reading *reading, const yaml_node_t *value)
+{
+    reading->task->trigger = text_of(value);
+    reading->task->trigger_line = line_of(value);
+    if (!reading->task->trigger)
+        problem(reading->problems, line_of(value), "trigger: a list is not the name of a block");
+}
+
 static void read_priority(struct reading *reading, const yaml_node_t *value)
 {
     int64_t priority = 0;
@@ -275,6 +283,7 @@ static void read_overruns(struct reading *reading, const yaml_node_t *value)
 static const struct key task_keys[] = {
     {"period", true, read_period, "the time between two steps, such as 10 ms"},
     {"phase", false, read_phase, NULL},
+    {"trigger", false, read_trigger, NULL},
     {"priority", false, read_priority, NULL},
     {"overrun", false, read_overrun, NULL},
     {"overruns", false, read_overruns, NULL},
@@ -288,6 +297,8 @@ static void read_task(struct reading *reading, const yaml_node_t *root)
     read_keys(reading, root, task_keys, "task");
     if (task->period_ns && task->phase_ns >= task->period_ns)
         problem(reading->problems, line_of(root), "task: phase is not below the period");
+    if (task->trigger && task->phase_ns)
+        problem(reading->problems, task->trigger_line, "trigger: a step that is due when something comes has no phase");
 }
 
 void task_file_read(struct task_file *task, struct problems *problems)

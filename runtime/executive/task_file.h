@@ -2,6 +2,7 @@
  *
  *     period: 10 ms            # ns, us, ms, s
  *     phase: 0 ms              # steps are due this long after each multiple of the period
+ *     trigger: gyro            # steps are due when this block has something new; the period is how often that is
  *     priority: 80             # SCHED_FIFO, 2 to 98; 0: ordinary scheduling
  *     overrun: skip            # what follows a step that ends after the next one was due: skip, catch-up, stop-safe
  *     overruns: 10             # that many in a row lead to the safe state; 0: never
@@ -35,6 +36,8 @@ struct block_entry {
 struct task_file {
     int64_t period_ns, phase_ns, priority, overruns;
     enum overrun overrun;
+    const char *trigger; /* NULL: the clock */
+    unsigned trigger_line;
     struct block_entry *blocks; /* in the order of the file */
     size_t count;
     yaml_document_t document; /* owns the texts */

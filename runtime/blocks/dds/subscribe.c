@@ -1,9 +1,12 @@
 #define _GNU_SOURCE
 #include "topic.h"
 
+#include <errno.h>
 #include <flotilla/sensor.h>
 #include <stdatomic.h>
 #include <string.h>
+#include <sys/eventfd.h>
+#include <unistd.h>
 
 enum { WAITING = 16, BATCH = 8 };
 
@@ -18,6 +21,8 @@ struct state {
     struct fl_driver *driver;
     struct fl_ring samples;
     struct dds_sample arriving, taken; /* DDS's thread's, the step's */
+    int arrived_fd;                    /* readable after something was put into the ring */
+    bool open, held;                   /* held: the next step finds its first sample in `taken` */
     _Atomic uint32_t peers;
     _Atomic bool late; /* the deadline passed since the last sample */
     struct fl_sensor sensor;
@@ -61,6 +66,7 @@ static void arrived(dds_entity_t reader, void *context)
             state->arriving.arrived_ns = now_ns;
             atomic_store(&state->late, false);
             fl_ring_put(&state->samples, &state->arriving);
+            eventfd_write(state->arrived_fd, 1);
         }
         dds_return_loan(reader, samples, count);
         samples[0] = NULL;
@@ -114,15 +120,33 @@ static int start(struct fl_block *block)
     state->block = block;
     fl_sensor_begin(&state->sensor);
     fl_ring_initialize(&state->samples, memory, sizeof(struct dds_sample), WAITING);
+    state->arrived_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    if (state->arrived_fd < 0)
+        return fl_fail(block, "eventfd: %s", strerror(errno));
+    state->open = true;
     state->driver = fl_driver_start(block, run, state);
     return state->driver ? FL_OK : FL_FAILED;
+}
+
+static int64_t await(struct fl_block *block, int64_t until_ns)
+{
+    struct state *state = block->state;
+    do {
+        eventfd_t count;
+        eventfd_read(state->arrived_fd, &count); /* before the look into the ring: what comes after it is not missed */
+        state->held = fl_ring_take(&state->samples, &state->taken);
+        if (state->held)
+            return state->taken.arrived_ns;
+    } while (fl_await_readable(state->arrived_fd, until_ns));
+    return 0;
 }
 
 static int step(struct fl_block *block)
 {
     const struct dds_subscribe *set = block->parameters;
     struct state *state = block->state;
-    for (int i = 0; i < WAITING && fl_ring_take(&state->samples, &state->taken); i++) {
+    for (int i = 0; i < WAITING && (state->held || fl_ring_take(&state->samples, &state->taken)); i++) {
+        state->held = false;
         memcpy(block->out[VALUES], state->taken.values, dds_value_bytes(&state->settings));
         FL_OUT(block, NUMBER, uint32_t) = state->taken.number;
         FL_OUT(block, STAMP, int64_t) = state->taken.stamp_ns;
@@ -137,6 +161,8 @@ static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
     fl_driver_stop(state->driver);
+    if (state->open)
+        close(state->arrived_fd);
 }
 
 FL_BLOCK(dds_subscribe) = {
@@ -150,5 +176,6 @@ FL_BLOCK(dds_subscribe) = {
     .configure = configure,
     .start = start,
     .step = step,
+    .await = await,
     .terminate = terminate,
 };

@@ -1,5 +1,6 @@
 #include "udp.h"
 
+#include <flotilla/driver.h>
 #include <flotilla/sensor.h>
 #include <string.h>
 
@@ -32,6 +33,7 @@ struct state {
     struct udp_receiver receiver;
     struct fl_sensor sensor;
     uint8_t *scratch;
+    int64_t arrived_ns; /* of what is in scratch for the next step; 0: nothing is */
 };
 
 static int configure(struct fl_block *block)
@@ -56,15 +58,30 @@ static int start(struct fl_block *block)
     return udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from);
 }
 
+/* What is refused is no reason for a step. */
+static int64_t await(struct fl_block *block, int64_t until_ns)
+{
+    const struct udp_receive *udp = block->parameters;
+    struct state *state = block->state;
+    do {
+        int budget = UDP_BURST;
+        if (udp_receive(&state->receiver, state->scratch, (size_t)udp->length, &state->arrived_ns, &budget))
+            return state->arrived_ns;
+        state->arrived_ns = 0;
+    } while (fl_await_readable(state->receiver.fd, until_ns));
+    return 0;
+}
+
 static int step(struct fl_block *block)
 {
     const struct udp_receive *udp = block->parameters;
     struct state *state = block->state;
-    int64_t arrived_ns;
     int budget = UDP_BURST;
-    while (udp_receive(&state->receiver, state->scratch, (size_t)udp->length, &arrived_ns, &budget)) {
+    while (state->arrived_ns ||
+           udp_receive(&state->receiver, state->scratch, (size_t)udp->length, &state->arrived_ns, &budget)) {
         memcpy(block->out[DATA], state->scratch, (size_t)udp->length);
-        fl_sensor_update(&state->sensor, arrived_ns, state->sensor.sequence + 1);
+        fl_sensor_update(&state->sensor, state->arrived_ns, state->sensor.sequence + 1);
+        state->arrived_ns = 0;
         if (udp->take == IN_ORDER)
             break;
     }
@@ -92,5 +109,6 @@ FL_BLOCK(udp_receive) = {
     .configure = configure,
     .start = start,
     .step = step,
+    .await = await,
     .terminate = terminate,
 };

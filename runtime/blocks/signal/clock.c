@@ -2,10 +2,18 @@
 
 #include <flotilla/block.h>
 
-enum { TIME, STEP, MONOTONIC, OFFSET, WALL_NS, WALL };
+enum { TIME, STEP, MONOTONIC, OFFSET, WALL_NS, WALL, NOW };
 
 struct state {
     int64_t begin_ns;
+};
+
+static const struct fl_port inputs[] = {
+    {.name = "after",
+     .type = FL_BOOLEAN,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "lets it run after another block"},
 };
 
 static const struct fl_port outputs[] = {
@@ -27,6 +35,11 @@ static const struct fl_port outputs[] = {
      .unit = "ns",
      .summary = "when this step was due, since 1970-01-01 UTC"},
     {.name = "wall", .type = FL_DOUBLE, .width = 1, .unit = "s", .summary = "the same, rounded to 0.24 µs"},
+    {.name = "now_ns",
+     .type = FL_INT64,
+     .width = 1,
+     .unit = "ns",
+     .summary = "when this block ran, by the clock that is never set"},
 };
 
 static int step(struct fl_block *block)
@@ -41,6 +54,7 @@ static int step(struct fl_block *block)
     FL_OUT(block, OFFSET, int64_t) = offset;
     FL_OUT(block, WALL_NS, int64_t) = block->release_ns + offset;
     FL_OUT(block, WALL, double) = 1e-9 * (double)(block->release_ns + offset);
+    FL_OUT(block, NOW, int64_t) = fl_now_ns();
     return FL_OK;
 }
 
@@ -49,6 +63,7 @@ FL_BLOCK(clock) = {
     .name = "clock",
     .summary = "the time of the step, by the monotonic and by the wall clock",
     .source = "clock_gettime(2): CLOCK_MONOTONIC, CLOCK_REALTIME",
+    FL_TABLE(input, inputs),
     FL_TABLE(output, outputs),
     .state_size = sizeof(struct state),
     .step = step,

@@ -8,6 +8,7 @@
  *   start        opens devices, allocates (fl_allocate), starts a driver thread; may block, may fail
  *   initialize   sets state and outputs as of time zero; not timed
  *   step         once each period of the block, in real time: no allocation, no call that may block
+ *   await        where the block may be a task's `trigger`: waits, in real time, for what the next step shall take
  *   safe         an actuator's outputs go to their reset state; in real time, at any moment after start
  *   terminate    outputs to their reset state, devices closed; also after a start that failed halfway
  *
@@ -21,7 +22,7 @@
 #include <stdint.h>
 
 /* Changes whenever a structure of this header does. A plug-in of another version is refused. */
-#define FL_ABI 1u
+#define FL_ABI 2u
 
 enum { FL_OK = 0, FL_FAILED = -1 };
 
@@ -182,6 +183,8 @@ struct fl_block_type {
     int (*start)(struct fl_block *block);
     int (*initialize)(struct fl_block *block);
     int (*step)(struct fl_block *block);
+    /* Until something came for the step, or CLOCK_MONOTONIC is `until_ns`: when it came, or 0 if nothing did. */
+    int64_t (*await)(struct fl_block *block, int64_t until_ns);
     void (*safe)(struct fl_block *block);
     void (*terminate)(struct fl_block *block);
 };

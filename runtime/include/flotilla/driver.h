@@ -25,6 +25,9 @@ void fl_driver_stop(struct fl_driver *driver);
  * 1 ready, 0 time-out, -1 the thread shall return, -2 the device is gone (hang-up or error). */
 int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int timeout_ms);
 
+/* Wait, in a block's `await`, until `fd` is readable: true; or CLOCK_MONOTONIC is `until_ns`: false. */
+bool fl_await_readable(int fd, int64_t until_ns);
+
 /* --- serial port --- */
 
 /* Members and parameters of a block with a serial port, as the port's mask lists them. */
