@@ -158,6 +158,35 @@ def test_a_program_that_ignores_sigterm_is_ended_and_its_relays_are_reset(bench:
     assert SAID in log.splitlines()
 
 
+SPINNING_TASK = """
+period: 10 ms
+priority: 70
+blocks:
+  teeth: {type: spinning}
+  relays: {type: ir104-pbf, in: {command: [1, 1], flag: 1}, parameters: {base: 0x300, channels: [1, 2]}}
+"""
+
+
+def test_a_step_that_spins_without_end_is_ended_until_it_is_given_up(bench: Bench) -> None:
+    """On one processor nothing else runs meanwhile. Seen to fail with the guard at ordinary priority: nobody answers."""
+    directory = bench.new("block", "spinning")
+    source = directory / "spinning.c"
+    source.write_text(source.read_text().replace("*phase +=", "while (block->step > 20)\n        ;\n    *phase +="))
+    (directory / "task.yml").write_text(SPINNING_TASK)
+    bench.place(directory)
+    bench.do("spinning", "start")
+    assert bench.wait_relays(on=True), "the app does not start"
+    assert bench.wait_relays(on=False), "relays stay on while a step spins"
+    end = time.monotonic() + 120
+    while (status := bench.status("spinning"))["ActiveState"] != "failed" and time.monotonic() < end:
+        pass  # asking takes a second
+    assert status["ActiveState"] == "failed", status
+    assert not any(bench.relays.relays)
+    log = bench.guest.shell.run(["sudo", "journalctl", "-o", "cat", "-u", "flotilla-app@spinning"]).stdout
+    assert log.count("no step for ten periods and a second, after step 21; outputs are in their reset state") == 5
+    bench.do("spinning", "remove")
+
+
 def test_a_kept_app_starts_with_the_robot(bench: Bench) -> None:
     """Power fails as soon as the command is done. An app that is not kept shows that the restart was one."""
     with bench.connection() as to:
