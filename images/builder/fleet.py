@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Strict
 from pydantic_core import PydanticCustomError
 
+from images.builder.errors import UserError
+
 BAUDS = (300, 600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 """Rates of termios(3) that serial devices use. A plain 16550A ends at 115200."""
 
@@ -241,6 +243,8 @@ class Network(_Model):
         ]
     ]
     """UDP ports or ranges (`5000-5099`) that robots accept from fleet addresses, DDS excepted."""
+    transport: Literal["udp", "dds"] = "udp"
+    """What carries messages between control tasks of several robots: datagrams, or Cyclone DDS topics."""
 
 
 class Device(_Model):
@@ -276,6 +280,14 @@ class Fleet(_Model):
     robots: dict[int, Robot]
     """By number, ascending."""
     stations: list[Host]
+
+    def robot_with(self, task: str) -> Robot:
+        """The one robot that has a control task, for tasks that talk to it."""
+        there = [robot for robot in self.robots.values() if task in robot.control_tasks]
+        if len(there) != 1:
+            names = " and ".join(robot.name for robot in there) or "no robot"
+            raise UserError(f"control task {task}: {names} has it, and another task talks to the one that has")
+        return there[0]
 
     def interface(self, robot: Robot) -> str:
         """Kernel name of the interface that the robot's address belongs to."""

@@ -116,7 +116,7 @@ def _environment() -> jinja2.Environment:
     import jinja2  # here, because it takes a while, in which the build has other things to do
 
     return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(paths.OVERLAY),
+        loader=jinja2.FileSystemLoader([paths.OVERLAY, paths.TASKS]),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -149,7 +149,7 @@ def _task(name: str, values: dict[str, object]) -> bytes:
     file = paths.TASKS / f"{name}.yml"
     try:
         return _environment().from_string(file.read_text(encoding="utf-8")).render(values).encode()
-    except (jinja2.TemplateError, OSError) as error:
+    except (jinja2.TemplateError, OSError, UserError) as error:
         raise UserError(f"{paths.shown(file)}: {error}") from error
 
 

@@ -1,0 +1,120 @@
+"""What came of a flight: from the recordings of station and plant to the figures by which it is judged."""
+
+from __future__ import annotations
+
+import bisect
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from runtime.station import recording
+from tests.latency.results import Latency
+
+HOPS = ("sensors → navigation", "navigation → control", "control → thruster mapping", "thruster mapping → valves")
+_STAMPS = ("sensed_ns", "navigation_ns", "control_ns", "mapping_ns", "valves_ns")
+"""When a step's message was sent by the first task, and arrived at each of the others."""
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Error:
+    """Of the flight against what was commanded."""
+
+    rms_m: float
+    max_m: float
+    max_heading_rad: float
+
+
+@dataclass(frozen=True)
+class Thrusters:
+    """What the valves did, over the whole flight: latency shows here before it shows in the error."""
+
+    on_time_s: float
+    switches: int
+
+
+class Flight:
+    """`directory`: what `virtual.fly` returned."""
+
+    def __init__(self, directory: Path) -> None:
+        self.flown = _records(directory / "plant", "flown")
+        self.steps = _records(directory / "station", "steps")
+        self.controls = _records(directory / "station", "controls")
+        self.statistics: dict[str, dict[str, Any]] = {
+            path.parent.name: json.loads(path.read_text()) for path in sorted(directory.glob("*/statistics.json"))
+        }
+        self._flown_ns: list[int] = [record["time_ns"] for record in self.flown]
+
+    def pose_at(self, time_ns: int) -> tuple[float, float, float]:
+        """x, y in m and heading in rad, between the plant's records."""
+        after = min(max(bisect.bisect(self._flown_ns, time_ns), 1), len(self.flown) - 1)
+        (x0, y0, a0), (x1, y1, a1) = self.flown[after - 1]["pose"], self.flown[after]["pose"]
+        begin, end = self._flown_ns[after - 1], self._flown_ns[after]
+        share = (time_ns - begin) / (end - begin)
+        return x0 + share * (x1 - x0), y0 + share * (y1 - y0), a0 + share * (a1 - a0)
+
+    @cached_property
+    def arrived(self) -> list[Record]:
+        """The first record of each of the robot's steps whose command reached the valves."""
+        seen: dict[int, Record] = {}
+        for record in self.steps:
+            if record["sequence"] and record["sensed_ns"]:
+                seen.setdefault(record["number"], record)
+        return [seen[number] for number in sorted(seen)]
+
+    @cached_property
+    def commanded(self) -> list[Record]:
+        """While the path is flown."""
+        return [record for record in self.controls if record["flying"] and not record["done"]]
+
+    @property
+    def completed(self) -> bool:
+        """The path was commanded to its end."""
+        return any(record["done"] for record in self.controls)
+
+    def error(self) -> Error:
+        errors = []
+        headings = []
+        for record in self.commanded:
+            x, y, heading = self.pose_at(record["time_ns"])
+            errors.append(math.hypot(record["wanted"][0] - x, record["wanted"][1] - y))
+            headings.append(abs(heading))
+        rms = math.sqrt(sum(error * error for error in errors) / len(errors))
+        return Error(rms, max(errors), max(headings))
+
+    def thrusters(self) -> Thrusters:
+        last = self.flown[-1]
+        return Thrusters(sum(last["on_time"]), sum(last["switches"]))
+
+    def hop(self, index: int) -> Latency:
+        """From one task's release to the next one's, in which the former's step lies."""
+        return _latency([step[_STAMPS[index + 1]] - step[_STAMPS[index]] for step in self.arrived])
+
+    def latency(self) -> Latency:
+        """From when the sensors' step was due until the valves are switched: four hops."""
+        return _latency([step["now_ns"] + step["offset_ns"] - step["sensed_ns"] for step in self.arrived])
+
+    def lost(self) -> int:
+        """Of the robot's steps, from the first whose command arrived to the last: those whose did not."""
+        numbers = [step["number"] for step in self.arrived]
+        return numbers[-1] - numbers[0] + 1 - len(numbers)
+
+
+def _records(directory: Path, name: str) -> list[Record]:
+    """All records of a recorder."""
+    files = sorted(directory.glob(f"{name}-*.rec"))
+    if not files:
+        raise FileNotFoundError(f"{directory} has no recording {name}")
+    return [record for file in files for record in recording.read(file).records]
+
+
+def _latency(nanoseconds: Sequence[int]) -> Latency:
+    histogram: dict[int, int] = {}
+    for each in nanoseconds:
+        histogram[each // 1000] = histogram.get(each // 1000, 0) + 1
+    return Latency.of(histogram)
