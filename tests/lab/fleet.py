@@ -27,7 +27,7 @@ from images.builder.build import image_of
 from images.builder.errors import UserError
 from images.builder.fleet import Fleet, Robot
 from tests.lab.guest import Guest
-from tests.lab.segment import Segment
+from tests.lab.segment import Segment, station_address
 from tests.lab.ssh import Ssh
 from tests.lab.timing import LabError
 
@@ -56,12 +56,10 @@ def guests_inventory(ports: Mapping[str, int]) -> str:
 @contextmanager
 def running(fleet: Fleet, robots: Sequence[Robot], directory: Path) -> Iterator[tuple[dict[str, Guest], Segment]]:
     """The robots as guests on one segment with the station, switched on, by name; not yet booted."""
-    station = fleet.stations[0].address if fleet.stations else qemu.station_address(
-        fleet.network, *(robot.address for robot in robots)
-    )  # fmt: skip
     with ExitStack() as stack:
         addresses = [robot.address for robot in robots]
-        segment = stack.enter_context(Segment(fleet.network, addresses, station, directory / "segment"))
+        segment = Segment(fleet.network, addresses, station_address(fleet), directory / "segment")
+        stack.enter_context(segment)
         guests = {}
         for robot in robots:
             options = qemu.Options(name=robot.name, mac=qemu.robot_mac(robot.number), link=segment.link(robot.address))
