@@ -65,10 +65,7 @@ class Connection:
                 f"{name}: refused, because its host key is not the one of {paths.shown(paths.KEYS / 'known_hosts')}: "
                 "another robot's card is in it, its image was made with other keys, or somebody is in between\n" + said
             )
-        return UserError(
-            f"{name} did not answer: {said or 'the connection broke'}; is it on and reachable? "
-            f"`make ssh ROBOT={self.robot.number}`"
-        )
+        return boot.no_answer(self.robot, said or "the connection broke")
 
 
 @contextmanager
