@@ -197,6 +197,8 @@ def is_up(unit: dict[str, str]) -> bool:
     """Whether a service does what it is there for."""
     if unit["ActiveState"] in ("active", "reloading"):
         return True
+    if unit["ActiveState"] == "activating":  # a robot may have just booted; one that fails again and again is waiting
+        return not unit["SubState"].startswith("auto-restart")
     done = unit["Type"] == "oneshot" and unit["RemainAfterExit"] == "no" and unit["Result"] == "success"
     return unit["ActiveState"] == "inactive" and (unit["ConditionResult"] == "no" or done)
 
