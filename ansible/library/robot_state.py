@@ -4,8 +4,8 @@
 A robot's root is common to all; what it has of its own lies in the layer above /etc on its data partition. So drift is
 what differs there from what the image brought, and nothing else needs to be looked at.
 
-This module reads its arguments as text and does without `AnsibleModule`, whose import takes an emulated Pentium III six
-seconds; this whole module takes it two or three.
+This module reads its arguments as text and does without `AnsibleModule`, whose import takes an emulated Pentium III
+seconds.
 """
 
 from __future__ import annotations
