@@ -21,12 +21,13 @@ kernel: | setup ## our own real-time kernel as a Debian package: make kernel BOA
 	$(Q)$(FLOTILLA) kernel --board $(call need,BOARD)
 
 flash: | setup ## write a card and read it back: make flash ROBOT=3 DEV=/dev/sdX (or CARD=file)
-	$(Q)$(FLOTILLA) flash --robot $(call need,ROBOT) $(if $(CARD),--file $(CARD),--device $(call need,DEV)) $(if $(FORCE),--force $(FORCE))
+	$(Q)$(FLOTILLA) flash --robot $(call need,ROBOT) $(if $(CARD),--file $(CARD),--device $(call need,DEV)) \
+	    $(if $(FORCE),--force $(FORCE))
 
 boot: | setup-tests ## boot a robot's image in QEMU on this terminal
 	$(Q)$(FLOTILLA) boot --robot $(call need,ROBOT)
 
-ssh: | setup ## shell on a robot, or on its guest when `make boot` runs: make ssh ROBOT=3
+ssh: | setup ## shell on a robot, or on its guest when one runs: make ssh ROBOT=3
 	$(Q)$(FLOTILLA) ssh --robot $(call need,ROBOT)
 
 verify: | setup ## build a second time under other circumstances and compare to the byte
@@ -75,7 +76,7 @@ requirements: | setup ## lock the Python environment anew from requirements.in
 
 ##@ Quality
 .PHONY: check test bench
-check: | setup-tests ## lint, types and unit tests, under a minute
+check: | setup-tests ## lint, types and unit tests, of the runtime too; no images, no QEMU
 	$(Q)$(VENV)/bin/ruff format --check .
 	$(Q)$(VENV)/bin/ruff check .
 	$(Q)$(VENV)/bin/mypy
@@ -126,7 +127,8 @@ fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFu
 
 bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
 	$(Q)images/install-host-packages runtime/bench/packages.txt
-	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ROUNDS),--rounds $(ROUNDS))
+	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS)) \
+	    $(if $(ROUNDS),--rounds $(ROUNDS))
 
 param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
 	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))

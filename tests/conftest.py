@@ -21,7 +21,6 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from images.builder import inventory, paths, qemu
 from images.builder.build import build, image_of
 from images.builder.fleet import Board, Fleet, Robot
 from tests.lab.guest import Guest
-from tests.lab.segment import Segment
+from tests.lab.segment import Segment, station_address
 from tests.lab.ssh import Ssh
 
 pytest_plugins = ["tests.lab.artefacts"]
@@ -130,17 +129,9 @@ def segment(fleet: Fleet, artefacts: Path) -> Iterator[Segment]:
 
     A fresh guest without one is alone with the station.
     """
-    with Segment(
-        fleet.network, [robot.address for robot in fleet.robots.values()], _station(fleet), artefacts / "segment"
-    ) as segment:
+    robots = [robot.address for robot in fleet.robots.values()]
+    with Segment(fleet.network, robots, station_address(fleet), artefacts / "segment") as segment:
         yield segment
-
-
-def _station(fleet: Fleet) -> IPv4Address:
-    """What the host is to the guests."""
-    if fleet.stations:
-        return fleet.stations[0].address
-    return qemu.station_address(fleet.network, *(robot.address for robot in fleet.robots.values()))
 
 
 def _boot(
@@ -167,7 +158,7 @@ def _boot(
     if segment:
         link = segment.link(robot.address)
     else:
-        link = qemu.UserLink(subnet=fleet.network.subnet, guest=robot.address, station=_station(fleet))
+        link = qemu.UserLink(subnet=fleet.network.subnet, guest=robot.address, station=station_address(fleet))
     options = qemu.Options(**{"name": robot.name, "mac": qemu.robot_mac(number), "link": link, **(qemu_options or {})})
     machine = cleanup.enter_context(Guest(board, image, directory, options, **arguments))
     port = (lambda: segment.ssh_port(robot.address)) if segment else machine.ssh_port

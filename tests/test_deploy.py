@@ -19,7 +19,7 @@ from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
 from tests.conftest import GuestFactory, RobotGuest
 from tests.emulators.ir104 import Ir104
-from tests.test_control_loop import RelayPorts
+from tests.lab.relay_ports import RelayPorts
 
 pytestmark = pytest.mark.boot
 

@@ -118,21 +118,24 @@ def guests(fleet: Fleet, session_artefacts: Path) -> Iterator[Guests]:
         yield Guests({robot.name: robot for robot in robots}, machines, shells, ports, directory)
 
 
-DRIFT = {
-    "robot1": (
+DRIFT = [
+    (
+        "robot1",
         "sed -i 's/kp: .*, kd/kp: 9, kd/' /etc/flotilla/tasks/heading.yml",
         "/etc/flotilla/tasks/heading.yml has another",
     ),
-    "robot2": ("nft flush ruleset", "the rules in force are others"),
-    "robot3": ("rm /etc/udev/rules.d/70-robot.rules", "/etc/udev/rules.d/70-robot.rules is missing"),
-    "robot4": ("ip address add 10.42.0.77/24 dev eth0", "address 10.42.0.4/24, 10.42.0.77/24"),
-}
+    ("robot2", "nft flush ruleset", "the rules in force are others"),
+    ("robot3", "rm /etc/udev/rules.d/70-robot.rules", "/etc/udev/rules.d/70-robot.rules is missing"),
+    ("robot4", "ip address add 10.42.0.77/24 dev eth0", "address 10.42.0.4/24, 10.42.0.77/24"),
+    ("robot2", "systemctl stop flotilla-zram", "flotilla-zram.service does not run"),
+    ("robot3", "rm -r /etc/systemd/system/multi-user.target.wants", "multi-user.target.wants was removed"),
+    (
+        "robot4",
+        "echo ssh-ed25519 AAAA stranger >>/etc/ssh/authorized_keys/robot",
+        "authorized_keys/robot has another",
+    ),
+]
 """What goes astray on each robot, as a script, and how the report names it."""
-MORE_DRIFT = {
-    "robot2": ("systemctl stop flotilla-zram", "flotilla-zram.service does not run"),
-    "robot3": ("rm -r /etc/systemd/system/multi-user.target.wants", "multi-user.target.wants was removed"),
-    "robot4": ("echo ssh-ed25519 AAAA stranger >>/etc/ssh/authorized_keys/robot", "authorized_keys/robot has another"),
-}  # fmt: skip
 
 
 def test_robots_that_were_just_flashed_are_up_to_date(guests: Guests) -> None:
@@ -146,8 +149,7 @@ def test_robots_that_were_just_flashed_are_up_to_date(guests: Guests) -> None:
 
 
 def test_drift_is_shown_mended_and_gone(guests: Guests) -> None:
-    planted = [(name, *drift) for table in (DRIFT, MORE_DRIFT) for name, drift in table.items()]
-    for name, script, _ in planted:
+    for name, script, _ in DRIFT:
         guests.sudo(name, script)
     of_an_app = "/etc/systemd/system/flotilla-app@some.service.d"
     guests.sudo("robot4", f"ln -s /data/apps/some/unit.d {of_an_app}")
@@ -159,7 +161,7 @@ def test_drift_is_shown_mended_and_gone(guests: Guests) -> None:
     mended = guests.play(*AT_ONCE)
     assert mended.status == 0, mended.said
     assert mended.outcomes() == dict.fromkeys(guests.robots, "changed")
-    for name, _, words in planted:
+    for name, _, words in DRIFT:
         for run in (shown, mended):
             assert any(words in line for line in run.mended(name)), (name, words, run.mended(name))
     again = guests.play(*AT_ONCE)
@@ -288,7 +290,7 @@ def test_robots_restart_and_are_healthy(guests: Guests) -> None:
 
 
 def test_a_new_card_can_get_a_new_host_key_everywhere(guests: Guests, tmp_path: Path) -> None:
-    """With keys of its own, so the last test of these guests. Seen to fail without the retired key in known_hosts."""
+    """With keys of its own, so the last test of these guests."""
     keys = tmp_path / "keys"
     shutil.copytree(paths.KEYS, keys)
     old = (keys / "robot4_ed25519.pub").read_text().split()[1]

@@ -4,8 +4,8 @@
 A robot's root is common to all; what it has of its own lies in the layer above /etc on its data partition. So drift is
 what differs there from what the image brought, and nothing else needs to be looked at.
 
-This module reads its arguments as text and does without `AnsibleModule`, whose import takes an emulated Pentium III six
-seconds; this whole module takes it two or three.
+This module reads its arguments as text and does without `AnsibleModule`, whose import takes an emulated Pentium III
+seconds.
 """
 
 from __future__ import annotations
@@ -197,6 +197,8 @@ def is_up(unit: dict[str, str]) -> bool:
     """Whether a service does what it is there for."""
     if unit["ActiveState"] in ("active", "reloading"):
         return True
+    if unit["ActiveState"] == "activating":  # a robot may have just booted; one that fails again and again is waiting
+        return not unit["SubState"].startswith("auto-restart")
     done = unit["Type"] == "oneshot" and unit["RemainAfterExit"] == "no" and unit["Result"] == "success"
     return unit["ActiveState"] == "inactive" and (unit["ConditionResult"] == "no" or done)
 

@@ -28,8 +28,6 @@ Show = Callable[[str], None]
 _SCRIPT = Path(__file__).with_suffix(".sh")
 _RESERVE_KIB = 4096
 """Of the data partition, for the robot's journal and an app's statistics."""
-_MACHINES = {"i386": "i?86", "amd64": "x86_64"}
-"""What uname says, as a pattern of the shell's, by Debian's name of the architecture."""
 
 _ENDED = {"7ad2d189f7e94e70a38c781354912448": "success", "d9b373ed55a64feb8242e02dbe79a49c": "failure"}
 """MESSAGE_ID of what the service manager says when a service has ended (systemd's sd-messages.h); its result."""
@@ -65,10 +63,7 @@ class Connection:
                 f"{name}: refused, because its host key is not the one of {paths.shown(paths.KEYS / 'known_hosts')}: "
                 "another robot's card is in it, its image was made with other keys, or somebody is in between\n" + said
             )
-        return UserError(
-            f"{name} did not answer: {said or 'the connection broke'}; is it on and reachable? "
-            f"`make ssh ROBOT={self.robot.number}`"
-        )
+        return boot.no_answer(self.robot, said or "the connection broke")
 
 
 @contextmanager
@@ -95,7 +90,7 @@ def send(to: Connection, subject: app.App, board: Board, files: Path) -> None:
     description = subject.description
     program = Path(description.program).name if isinstance(description, app.Make) else ""
     version = cache.digest(*sorted(files.iterdir()))[:16]
-    arguments = [version, _MACHINES[board.architecture], str(need_kib), program]
+    arguments = [version, board.machine, str(need_kib), program]
     with progress.step(f"{subject.name} to {to.robot.name}, {progress.size(size)}"):
         to.run("receive", subject.name, *arguments, stdin=archive.getvalue())
 

@@ -28,7 +28,8 @@ def boot(robot: Robot, board: Board, network: Network, image: Path, station: IPv
     if not image.exists():
         raise UserError(f"{paths.shown(image)} is missing; build it: make image ROBOT={robot.number}")
     qemu.program(board)  # complain about a missing QEMU before anything is left behind
-    with announced(robot, _free_port()) as port:
+    port = _free_port()
+    with announced(robot, port):
         overlay = RUN / f"{robot.name}.qcow2"
         qemu.make_overlay(image, overlay, qemu.CARD_BYTES)
         link = qemu.UserLink(
@@ -98,6 +99,11 @@ def ssh_options(robot: Robot) -> list[str]:
     return [word for name, value in settings.items() for word in ("-o", f'{name}="{value}"')]
 
 
+def no_answer(robot: Robot, said: str) -> UserError:
+    """That a command by `ssh_command` did not reach the robot, or broke off; `said`: what there is to say about it."""
+    return UserError(f"{robot.name} did not answer: {said}; is it on and reachable? `make ssh ROBOT={robot.number}`")
+
+
 def forwarded_port(robot: Robot) -> int | None:
     """The loopback port of the robot's guest, or None when none runs."""
     try:
@@ -117,7 +123,7 @@ DIE_WITH_PARENT = ["setpriv", "--pdeathsig", "KILL"]
 
 
 @contextmanager
-def announced(robot: Robot, port: int) -> Iterator[int]:
+def announced(robot: Robot, port: int) -> Iterator[None]:
     """Record for `make ssh` that the robot's guest listens on a loopback port, while the body runs.
 
     The file is never removed, since only its lock means something, and that ends with this process in whatever way.
@@ -132,7 +138,7 @@ def announced(robot: Robot, port: int) -> Iterator[int]:
         record.truncate(0)
         record.write(str(port))
         record.flush()
-        yield port
+        yield
 
 
 def _record(robot: Robot) -> Path:

@@ -183,6 +183,11 @@ class Board(_Model):
     """Kernel modules of devices that no bus announces, such as an ISA watchdog; loaded on every boot."""
     qemu: Qemu
 
+    @property
+    def machine(self) -> str:
+        """What `uname -m` may say on it: a regular expression that is a pattern of the shell's, too."""
+        return {"i386": "i[3-6]86", "amd64": "x86_64"}[self.architecture]
+
 
 class Ibss(_Model):
     """An 802.11 ad hoc cell. The BSSID is fixed, or cells split."""

@@ -7,7 +7,6 @@ import shlex
 import subprocess
 
 from images.builder import boot, paths, progress
-from images.builder.errors import UserError
 from images.builder.fleet import Robot
 
 CHECKS = {
@@ -69,17 +68,14 @@ def summary(found: dict[str, tuple[int, str]]) -> str:
 
 
 def check(robot: Robot, seconds: int) -> str:
-    """Ask the robot, or its guest when `make boot` runs; the summary, and where all of it is."""
+    """Ask the robot, or its guest when one runs; the summary, and where all of it is."""
     with progress.step(f"hardware of {robot.name}, {seconds} s for its latency"):
         done = subprocess.run(
             [*boot.ssh_command(robot), "sudo", "sh"], input=script(seconds), capture_output=True, text=True, check=False
         )
     found = parse(done.stdout)
     if done.returncode or found.keys() != CHECKS.keys():
-        raise UserError(
-            f"{robot.name} did not answer: {done.stderr.strip() or 'it ended in between'}; "
-            f"is it on and reachable? `make ssh ROBOT={robot.number}`"
-        )
+        raise boot.no_answer(robot, done.stderr.strip() or "it ended in between")
     file = paths.BUILD / "reports" / f"hwcheck-{robot.name}.txt"
     file.parent.mkdir(parents=True, exist_ok=True)
     text = summary(found)

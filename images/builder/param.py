@@ -22,10 +22,7 @@ def param(robot: Robot, task: str, parameter: str | None = None, value: str | No
     argv = [*boot.ssh_command(robot), shlex.join(words)]
     done = subprocess.run(argv, capture_output=True, encoding="utf-8", check=False)
     if done.returncode == _SSH_FAILED:
-        raise UserError(
-            f"{robot.name} did not answer: {done.stderr.strip()}; "
-            f"is it on and reachable? `make ssh ROBOT={robot.number}`"
-        )
+        raise boot.no_answer(robot, done.stderr.strip())
     if done.returncode:
         raise UserError(f"{robot.name}: {done.stderr.strip().removeprefix('flotilla-param: ')}")
     return done.stdout.rstrip("\n")

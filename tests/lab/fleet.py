@@ -11,12 +11,13 @@ import concurrent.futures
 import fcntl
 import functools
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -27,7 +28,7 @@ from images.builder.build import image_of
 from images.builder.errors import UserError
 from images.builder.fleet import Fleet, Robot
 from tests.lab.guest import Guest
-from tests.lab.segment import Segment
+from tests.lab.segment import Segment, station_address
 from tests.lab.ssh import Ssh
 from tests.lab.timing import LabError
 
@@ -56,12 +57,10 @@ def guests_inventory(ports: Mapping[str, int]) -> str:
 @contextmanager
 def running(fleet: Fleet, robots: Sequence[Robot], directory: Path) -> Iterator[tuple[dict[str, Guest], Segment]]:
     """The robots as guests on one segment with the station, switched on, by name; not yet booted."""
-    station = fleet.stations[0].address if fleet.stations else qemu.station_address(
-        fleet.network, *(robot.address for robot in robots)
-    )  # fmt: skip
     with ExitStack() as stack:
         addresses = [robot.address for robot in robots]
-        segment = stack.enter_context(Segment(fleet.network, addresses, station, directory / "segment"))
+        segment = Segment(fleet.network, addresses, station_address(fleet), directory / "segment")
+        stack.enter_context(segment)
         guests = {}
         for robot in robots:
             options = qemu.Options(name=robot.name, mac=qemu.robot_mac(robot.number), link=segment.link(robot.address))
@@ -133,12 +132,17 @@ def status() -> str:
 
 
 def down() -> str:
-    """End the virtual fleet and remove what it left."""
-    ports = _ports()
-    if ports:
-        os.kill(int(_LOCK.read_text()), signal.SIGTERM)
+    """End the virtual fleet, be it still starting, and remove what it left."""
+    ended = "no virtual fleet runs"
+    told = False
     deadline = time.monotonic() + DOWN_SECONDS
     while (lock := _free_lock()) is None:
+        if not told and (holder := _LOCK.read_text()):
+            ports = _written_ports()
+            ended = f"{len(ports)} guests ended" if ports else "the virtual fleet ended before it had started"
+            with suppress(ProcessLookupError):  # it has just ended
+                os.kill(int(holder), signal.SIGTERM)
+            told = True
         if time.monotonic() > deadline:
             raise UserError(
                 f"the virtual fleet did not end within {DOWN_SECONDS} s; process {_LOCK.read_text()} holds it"
@@ -146,21 +150,23 @@ def down() -> str:
         time.sleep(0.05)  # the lock tells nobody when it becomes free within a bound
     with lock:
         GUESTS.unlink(missing_ok=True)
-    return f"{len(ports)} guests ended" if ports else "no virtual fleet runs"
+    return ended
 
 
 def hold(count: int) -> None:
-    """Be the process in the background: a line on standard output for each robot that has booted."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    """Be the process in the background, until SIGTERM: a line on standard output for each robot that has booted."""
+    signal.signal(signal.SIGTERM, _end)
     lock = _free_lock()
     if lock is None:
         raise UserError("a virtual fleet runs already; end it: make fleet-down")
-    fleet = inventory.load_fleet()
-    robots = list(fleet.robots.values())[:count]
     with lock, ExitStack() as stack:
-        lock.truncate(0)
         lock.write(str(os.getpid()))
         lock.flush()
+        GUESTS.unlink(missing_ok=True)
+        for directory in filter(Path.is_dir, DIRECTORY.iterdir()):
+            shutil.rmtree(directory)  # a killed fleet's: its guests' overlays may be of other images
+        fleet = inventory.load_fleet()
+        robots = list(fleet.robots.values())[:count]
         guests, segment = stack.enter_context(running(fleet, robots, DIRECTORY))
         ports = {robot.name: segment.ssh_port(robot.address) for robot in robots}
         for robot in robots:
@@ -171,11 +177,19 @@ def hold(count: int) -> None:
             print(robot.name, flush=True)
         beside = GUESTS.with_suffix(".new")
         beside.write_text(guests_inventory(ports))
+        stack.callback(GUESTS.unlink, missing_ok=True)
         beside.rename(GUESTS)
         sys.stdout.close()
         os.close(1)
+        # Not signal.pause(), which would miss a signal that comes just before it.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         signal.sigwait({signal.SIGTERM})
-        GUESTS.unlink()
+
+
+def _end(*_: object) -> None:
+    """Handler of SIGTERM while the fleet starts."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one would interrupt the cleaning up
+    raise SystemExit("it was ended before it had started")
 
 
 def _ports() -> dict[str, int]:
@@ -184,14 +198,23 @@ def _ports() -> dict[str, int]:
     if lock is not None:
         lock.close()
         return {}
-    if not GUESTS.exists():
+    ports = _written_ports()
+    if not ports:
         raise UserError("a virtual fleet is starting or ending; try again, or end it: make fleet-down")
-    hosts = yaml.safe_load(GUESTS.read_text())["guests"]["hosts"]
+    return ports
+
+
+def _written_ports() -> dict[str, int]:
+    """What GUESTS says; nothing while it is not there."""
+    try:
+        hosts = yaml.safe_load(GUESTS.read_text())["guests"]["hosts"]
+    except FileNotFoundError:
+        return {}
     return {name: values["ansible_port"] for name, values in hosts.items()}
 
 
 def _free_lock() -> IO[str] | None:
-    """The lock, held until it is closed; None when a fleet runs."""
+    """The lock, empty and held until it is closed; None when a fleet runs."""
     DIRECTORY.mkdir(parents=True, exist_ok=True)
     lock = _LOCK.open("a+")
     try:
@@ -199,6 +222,7 @@ def _free_lock() -> IO[str] | None:
     except BlockingIOError:
         lock.close()
         return None
+    lock.truncate(0)  # a killed fleet's process may be another by now
     return lock
 
 

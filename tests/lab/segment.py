@@ -15,7 +15,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from images.builder import qemu
-from images.builder.fleet import Network
+from images.builder.fleet import Fleet, Network
 from tests.lab.emulator import Emulator
 
 
@@ -59,6 +59,13 @@ class Segment:
         for name, netdev in netdevs.items():
             argv += ["-netdev", netdev, "-netdev", f"hubport,id=hub-{name},hubid=0,netdev={name}"]
         return argv
+
+
+def station_address(fleet: Fleet) -> IPv4Address:
+    """The address under which guests of the fleet see the host: the first station's, or one that no robot has."""
+    if fleet.stations:
+        return fleet.stations[0].address
+    return qemu.station_address(fleet.network, *(robot.address for robot in fleet.robots.values()))
 
 
 def _free_udp_ports(count: int) -> list[int]:

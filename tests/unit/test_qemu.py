@@ -206,11 +206,11 @@ def test_boot_without_image(build: Path) -> None:
 
 def test_port_is_known_only_while_make_boot_runs(build: Path) -> None:
     assert boot.forwarded_port(ROBOT) is None
-    with boot.announced(ROBOT, 40022) as port:
-        assert boot.forwarded_port(ROBOT) == port
+    with boot.announced(ROBOT, 40022):
+        assert boot.forwarded_port(ROBOT) == 40022
         with pytest.raises(UserError, match="runs already"), boot.announced(ROBOT, 40023):
             pass
-        assert boot.forwarded_port(ROBOT) == port
+        assert boot.forwarded_port(ROBOT) == 40022
     assert boot.forwarded_port(ROBOT) is None
 
 
@@ -235,8 +235,8 @@ def test_ssh_pins_the_host_key(build: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_ssh_prefers_the_guest(build: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with boot.announced(ROBOT, 40022) as port:
-        assert ssh_command(monkeypatch)[-4:] == ["-p", str(port), "127.0.0.1", "uptime"]
+    with boot.announced(ROBOT, 40022):
+        assert ssh_command(monkeypatch)[-4:] == ["-p", "40022", "127.0.0.1", "uptime"]
 
 
 def test_ssh_without_keys(build: Path) -> None:

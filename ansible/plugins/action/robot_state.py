@@ -22,8 +22,6 @@ KEEP = [
     "/etc/systemd/system/multi-user.target.wants/flotilla-app@*",  # with KEEP=1
 ]
 """What a robot has in its layer of /etc besides, as shell patterns."""
-MACHINES = {"i386": "i686", "amd64": "x86_64"}
-"""What the kernel calls the processor, by Debian's architecture."""
 TASK = "flotilla-task@"
 
 
@@ -61,7 +59,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
                 "interface": arguments["interface"],
                 "addresses": [f"{robot.address}/{fleet.network.subnet.prefixlen}"],
                 "subnet": str(fleet.network.subnet),
-                "machine": MACHINES[fleet.boards[robot.board].architecture],
+                "machine": fleet.boards[robot.board].machine,
                 "uarts": sorted(
                     port.tty for port in fleet.boards[robot.board].ports.values() if port.tty.startswith("ttyS")
                 ),
