@@ -1,7 +1,7 @@
 #include <flotilla/block.h>
 #include <math.h>
 
-enum { MEASUREMENT, SEQUENCE };
+enum { MEASUREMENT, SEQUENCE, ACCELERATION };
 enum { VALUE, RATE };
 
 struct alpha_beta_filter {
@@ -33,6 +33,12 @@ static int configure(struct fl_block *block)
          .type = FL_UINT32,
          .width = 1,
          .summary = "changes with each new measurement, as a sensor's"},
+        {.name = "acceleration",
+         .type = FL_DOUBLE,
+         .width = width,
+         .unit = "1/s²",
+         .flags = FL_OPTIONAL,
+         .summary = "that is known, as of forces that were commanded"},
     };
     const struct fl_port out[] = {
         {.name = "value",
@@ -41,8 +47,11 @@ static int configure(struct fl_block *block)
          .summary = "of the measurement, now; zero before the first"},
         {.name = "rate", .type = FL_DOUBLE, .width = width, .unit = "1/s", .summary = "its change"},
     };
-    for (size_t i = 0; i < 2; i++)
-        if (fl_add_input(block, in[i]) != FL_OK || fl_add_output(block, out[i]) != FL_OK)
+    for (size_t i = 0; i < sizeof in / sizeof in[0]; i++)
+        if (fl_add_input(block, in[i]) != FL_OK)
+            return FL_FAILED;
+    for (size_t i = 0; i < sizeof out / sizeof out[0]; i++)
+        if (fl_add_output(block, out[i]) != FL_OK)
             return FL_FAILED;
     return FL_OK;
 }
@@ -73,11 +82,14 @@ static int step(struct fl_block *block)
 {
     const struct alpha_beta_filter *set = block->parameters;
     struct state *state = block->state;
-    const double *measurement = block->in[MEASUREMENT];
+    const double *measurement = block->in[MEASUREMENT], *acceleration = block->in[ACCELERATION];
     double *value = block->out[VALUE], *rate = block->out[RATE];
     const double period = 1e-9 * (double)block->period_ns;
-    for (int64_t i = 0; i < set->width; i++)
-        value[i] += rate[i] * period;
+    for (int64_t i = 0; i < set->width; i++) {
+        double change = isfinite(acceleration[i]) ? acceleration[i] * period : 0;
+        value[i] += (rate[i] + change / 2) * period;
+        rate[i] += change;
+    }
     if (!measured(block, state))
         return FL_OK;
     /* Critically damped: the gains of a line fitted by least squares to all measurements, older ones counting less. */

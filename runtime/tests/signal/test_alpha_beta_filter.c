@@ -67,6 +67,25 @@ static void goes_on_by_itself_without_measurements(void **state)
     testbed_end(filter);
 }
 
+/* An acceleration that is known is followed without error, too. */
+static void follows_a_known_acceleration(void **state)
+{
+    (void)state;
+    struct fl_block *filter = testbed_block("alpha-beta-filter", "time_constant", "0.1", NULL);
+    testbed_begin(filter);
+    for (uint32_t i = 0; i < 600; i++) {
+        double time = 0.01 * i;
+        SET(filter, "acceleration", double, i ? 3 : 0); /* of the period before the measurement */
+        filtered(filter, 1.5 * time * time, i + 1);
+        assert_near(GET(filter, "value", double), 1.5 * time * time, 1e-9);
+        assert_near(GET(filter, "rate", double), 3 * time, 1e-9);
+    }
+    SET(filter, "acceleration", double, NAN);
+    filtered(filter, 0, 600);
+    assert_near(GET(filter, "rate", double), 3 * 5.99, 1e-9);
+    testbed_end(filter);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -74,6 +93,7 @@ int main(void)
         cmocka_unit_test(corrects_by_the_gains),
         cmocka_unit_test(follows_a_constant_rate),
         cmocka_unit_test(goes_on_by_itself_without_measurements),
+        cmocka_unit_test(follows_a_known_acceleration),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
