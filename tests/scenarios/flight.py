@@ -48,6 +48,8 @@ class Flight:
         self.statistics: dict[str, dict[str, Any]] = {
             path.parent.name: json.loads(path.read_text()) for path in sorted(directory.glob("*/statistics.json"))
         }
+        self.events_ns: list[int] = json.loads((directory / "events.json").read_text())
+        """When the events of the plan had happened."""
         self._flown_ns: list[int] = [record["time_ns"] for record in self.flown]
 
     def pose_at(self, time_ns: int) -> tuple[float, float, float]:
@@ -57,6 +59,10 @@ class Flight:
         begin, end = self._flown_ns[after - 1], self._flown_ns[after]
         share = (time_ns - begin) / (end - begin)
         return x0 + share * (x1 - x0), y0 + share * (y1 - y0), a0 + share * (a1 - a0)
+
+    def since(self, time_ns: int) -> list[Record]:
+        """The plant's records from then on."""
+        return self.flown[bisect.bisect_left(self._flown_ns, time_ns) :]
 
     @cached_property
     def arrived(self) -> list[Record]:
@@ -101,7 +107,7 @@ class Flight:
 
     def lost(self) -> int:
         """Of the robot's steps, from the first whose command arrived to the last: those whose did not."""
-        numbers = [step["number"] for step in self.arrived]
+        numbers: list[int] = [step["number"] for step in self.arrived]
         return numbers[-1] - numbers[0] + 1 - len(numbers)
 
 

@@ -1,7 +1,7 @@
 """Runs in a guest: the computers of a fleet in a network namespace each, joined by simulated 802.11 radios in a cell.
 
-Standard library and what the image has; `python3 fly.py PLAN` reads `Plan` of virtual.py as JSON, and prints JSON: of each
-task its status, and the files that it left, in base64: recordings, statistics, and what it said.
+Standard library and what the image has; `python3 fly.py SESSION` reads what virtual.py wrote, and prints as JSON the
+files that tasks left, in base64: recordings, statistics, and what they said.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def join_cell(computers: list[dict[str, Any]]) -> None:
         within = ("ip", "netns", "exec", name)
         run(*within, "ip", "link", "set", "lo", "up")
         run(*within, "ip", "link", "set", radio, "name", "wlan0")
-        run(*within, "/usr/lib/flotilla/ibss", "wlan0")
+        join(name)
         run(*within, "ip", "address", "add", computer["address"], "dev", "wlan0")
     first, *others = computers
     for other in others:
@@ -57,36 +57,49 @@ def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
         return subprocess.Popen([*argv, task["file"]], stdout=log, stderr=log, env=environment, cwd=out)
 
 
-def fly(plan: dict[str, Any], out: Path) -> dict[str, Any]:
-    for link, device in plan["links"].items():
-        Path(link).parent.mkdir(parents=True, exist_ok=True)
-        Path(link).unlink(missing_ok=True)
-        Path(link).symlink_to(device)
-    join_cell(plan["computers"])
-    tasks = {task["name"]: start(task, out / task["name"]) for task in plan["tasks"]}
+def fly(flight: dict[str, Any], out: Path) -> None:
+    """Start the tasks, let things happen to them, end them; each has to end as asked."""
     begin = time.monotonic()
-    for event in sorted(plan["events"], key=lambda event: float(event["at_s"])):
+    happened: list[int] = []
+    tasks = {task["name"]: start(task, out / task["name"]) for task in flight["tasks"]}
+    for event in sorted(flight["events"], key=lambda event: float(event["at_s"])):
         time.sleep(max(0.0, begin + event["at_s"] - time.monotonic()))
         run(*event["command"])
-    time.sleep(max(0.0, begin + plan["seconds"] - time.monotonic()))
+        happened.append(time.monotonic_ns())
+    (out / "events.json").write_text(json.dumps(happened))
+    time.sleep(max(0.0, begin + flight["seconds"] - time.monotonic()))
     for task in tasks.values():
         task.send_signal(signal.SIGTERM)
     statuses = {name: task.wait(_END_S) for name, task in tasks.items()}
-    files = {
-        str(path.relative_to(out)): base64.b64encode(path.read_bytes()).decode()
-        for path in sorted(out.rglob("*"))
-        if path.is_file()
-    }
-    return {"statuses": statuses, "files": files}
+    if any(statuses.values()):
+        raise RuntimeError(f"{flight['name']}: tasks ended with {statuses}")
 
 
-def main(plan: Path) -> None:
+def join(computer: str) -> None:
+    """Put a computer into the cell, as its unit does; with nothing in the way of its packets."""
+    within = ("ip", "netns", "exec", computer)
+    run(*within, "/usr/lib/flotilla/ibss", "wlan0")
+    subprocess.run([*within, "tc", "qdisc", "del", "dev", "wlan0", "root"], capture_output=True, check=False)
+
+
+def main(session: dict[str, Any], out: Path) -> dict[str, Any]:
+    said: dict[str, Any] = {}
     try:
-        said = fly(json.loads(plan.read_text()), Path("/run/flight"))
+        for link, device in session["links"].items():
+            Path(link).parent.mkdir(parents=True, exist_ok=True)
+            Path(link).unlink(missing_ok=True)
+            Path(link).symlink_to(device)
+        join_cell(session["computers"])
+        for flight in session["flights"]:
+            fly(flight, out / flight["name"])
+            for computer in session["computers"]:
+                join(computer["name"])
     except Exception:
-        said = {"error": traceback.format_exc()}
-    print(json.dumps(said))
+        said["error"] = traceback.format_exc()
+    files = [path for path in sorted(out.rglob("*")) if path.is_file()]
+    said["files"] = {str(path.relative_to(out)): base64.b64encode(path.read_bytes()).decode() for path in files}
+    return said
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    print(json.dumps(main(json.loads(Path(sys.argv[1]).read_text()), Path("/run/flight"))))

@@ -1,8 +1,8 @@
 """Flights in virtual time: the fleet's computers as network namespaces of one guest, which boots the shipped system.
 
-Control tasks are those that images bring, rendered for the fleet of `inventory/`; radios are simulated (mac80211_hwsim),
-the cell, drivers and ports are not. The robot that flies is a plug-in, which reads the relay board's I/O port and writes
-gyro frames into a serial port whose output is its own input. A run repeats to the byte.
+Control tasks are those that images bring, rendered for the fleet of `inventory/`. Radios are simulated by
+mac80211_hwsim; the cell, drivers and ports are not. The robot that flies is a plug-in, which reads the relay board's
+I/O port and writes gyro frames into a serial port whose output is its own input. A run repeats to the byte.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import jinja2
@@ -30,8 +31,8 @@ STATION = "station"
 RELAYS = ("-chardev", "null,id=relays", "-device", "isa-parallel,iobase=0x300,chardev=relays")
 """What can be written and read back at the relay board's first register: a printer port's data register."""
 _BOOT_LIMIT_S = 600
-_LIMIT_PER_SECOND = 5
-"""Of the host's clock, for each virtual second."""
+_LIMIT_PER_SECOND = 10
+"""Of the host's clock, for each virtual second: finite, and generous to a busy host."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,23 @@ class Event:
 
 @dataclass(frozen=True)
 class Plan:
-    """A flight. `seconds` of it are virtual ones."""
+    """A flight."""
 
+    name: str
     seconds: float
+    """Of virtual time, from the start of the tasks to their end."""
     transport: str = "udp"
     events: Sequence[Event] = ()
     plant: Mapping[str, object] = field(default_factory=dict)
     """Parameters that are not those of floating_robot.yml."""
+    changes: Mapping[str, object] = field(default_factory=dict)
+    """Parameters of control tasks that are not those of their files, by `task.block.parameter`."""
+
+
+def square(name: str, side_m: float, **more: Any) -> Plan:
+    """Once around a square at 1 cm/s, as published (there 1 m), after some seconds for the tasks to begin."""
+    corners = [0, 0, side_m, 0, side_m, side_m, 0, side_m, 0, 0]
+    return replace(Plan(name, 4 * side_m / 0.01 + 6, changes={"control.path.waypoints": corners}), **more)
 
 
 def fleet(transport: str) -> Fleet:
@@ -66,13 +77,25 @@ def fleet(transport: str) -> Fleet:
     return described.model_copy(update={"network": network})
 
 
-def rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
-    """Files below /etc of each robot, by its name and theirs; keys are made in `keys`."""
+def _rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
+    """Files of each robot by its name and their path; keys are made in `keys`."""
     with mock.patch.object(paths, "KEYS", keys):
         return {
             robot.name: {str(path): content for path, (content, _) in identity.render(fleet, robot).items()}
             for robot in fleet.robots.values()
         }
+
+
+def _changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
+    """A control task with the parameters of `changes` that are its own."""
+    own = {key.split(".", 1)[1]: value for key, value in changes.items() if key.split(".")[0] == name}
+    if not own:
+        return content
+    task = yaml.load(content, yaml.BaseLoader)  # all is text to the runtime, `on` and `off` too
+    for key, value in own.items():
+        block, parameter = key.split(".")
+        task["blocks"][block]["parameters"][parameter] = value
+    return bytes(yaml.safe_dump(task, encoding="utf-8"))
 
 
 def _plant(plan: Plan, robot_address: str, gyro: str) -> bytes:
@@ -81,65 +104,79 @@ def _plant(plan: Plan, robot_address: str, gyro: str) -> bytes:
     return template.render(parameters=parameters, robot_address=robot_address, gyro=gyro).encode()
 
 
-def files(plan: Plan, board: Board, keys: Path) -> dict[str, bytes]:
-    """What enters the guest: by path."""
-    fleet_ = fleet(plan.transport)
-    flying = fleet_.robot_with("valves")
-    device = f"/dev/{board.ports[flying.devices['gyro'].port].tty}"
-    there: dict[str, bytes] = {}
-    tasks = []
-    each = rendered(fleet_, keys)
-    for robot in fleet_.robots.values():
-        brought = each[robot.name]
-        for name in ("ibss.conf", "cyclonedds.xml"):
-            there[f"{DIRECTORY}/{robot.name}/{name}"] = brought[f"/etc/flotilla/{name}"]
-        for name in robot.control_tasks:
-            file = f"{DIRECTORY}/{robot.name}/{name}.yml"
-            there[file] = brought[str(identity.TASKS / f"{name}.yml")]
-            tasks.append({"name": name, "computer": robot.name, "file": file,
-                          "cyclonedds": f"{DIRECTORY}/{robot.name}/cyclonedds.xml"})  # fmt: skip
-    there[f"{DIRECTORY}/plant/plant.so"] = runtime.compile_plugin(PLANT, board.architecture)
-    there[f"{DIRECTORY}/plant.yml"] = _plant(plan, str(flying.address), device)
-    there[f"{DIRECTORY}/station.yml"] = (HERE / "station.yml").read_bytes()
+def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """A flight as fly.py reads it, and its files by path."""
+    directory = DIRECTORY / plan.name
+    described = fleet(plan.transport)
+    flying = described.robot_with("valves")
+    there = {
+        f"{directory}/plant.yml": _plant(plan, str(flying.address), gyro_device(described, board)),
+        f"{directory}/station.yml": (HERE / "station.yml").read_bytes(),
+    }
     tasks = [
-        {"name": "station", "computer": STATION, "file": f"{DIRECTORY}/station.yml"},
-        {"name": "plant", "computer": STATION, "file": f"{DIRECTORY}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
-        *tasks,
+        {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
+        {"name": "plant", "computer": STATION, "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
     ]
-    length = fleet_.network.subnet.prefixlen
-    hosts = [*fleet_.robots.values(), *fleet_.stations]
-    there[f"{DIRECTORY}/fly.py"] = (HERE / "fly.py").read_bytes()
-    there[f"{DIRECTORY}/flight.json"] = json.dumps(
-        {
-            "computers": [{"name": host.name, "address": f"{host.address}/{length}"} for host in hosts],
-            "links": {"/dev/robot/gyro": device, "/etc/flotilla/ibss.conf": f"{DIRECTORY}/{flying.name}/ibss.conf"},
-            "tasks": tasks,
-            "seconds": plan.seconds,
-            "events": [asdict(event) for event in plan.events],
-        },
-        sort_keys=True,
-    ).encode()
-    return there
+    brought = _rendered(described, keys)
+    for robot in described.robots.values():
+        configuration = f"{directory}/{robot.name}-cyclonedds.xml"
+        there[configuration] = brought[robot.name]["/etc/flotilla/cyclonedds.xml"]
+        for name in robot.control_tasks:
+            file = f"{directory}/{name}.yml"
+            there[file] = _changed(name, brought[robot.name][str(identity.TASKS / f"{name}.yml")], plan.changes)
+            tasks.append({"name": name, "computer": robot.name, "file": file, "cyclonedds": configuration})
+    events = [asdict(event) for event in plan.events]
+    return {"name": plan.name, "seconds": plan.seconds, "tasks": tasks, "events": events}, there
 
 
-def fly(plan: Plan, board: Board, out: Path) -> Path:
-    """Fly it; what recorders and tasks left is in the directory that is returned, a folder for each task."""
+def gyro_device(described: Fleet, board: Board) -> str:
+    """Where the flying robot's gyro is plugged in."""
+    return f"/dev/{board.ports[described.robot_with('valves').devices['gyro'].port].tty}"
+
+
+def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
+    """What enters the guest: by path."""
+    described = fleet("udp")
+    flying = described.robot_with("valves")
+    cell = f"{DIRECTORY}/ibss.conf"
+    there = {
+        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
+        f"{DIRECTORY}/fly.py": (HERE / "fly.py").read_bytes(),
+        cell: _rendered(described, keys)[flying.name]["/etc/flotilla/ibss.conf"],
+    }
+    flights = []
+    for plan in plans:
+        flight, brought = _flight(plan, board, keys)
+        flights.append(flight)
+        there |= brought
+    length = described.network.subnet.prefixlen
+    hosts = [*described.robots.values(), *described.stations]
+    session = {
+        "computers": [{"name": host.name, "address": f"{host.address}/{length}"} for host in hosts],
+        "links": {"/dev/robot/gyro": gyro_device(described, board), "/etc/flotilla/ibss.conf": cell},
+        "flights": flights,
+    }
+    return there | {f"{DIRECTORY}/session.json": json.dumps(session, sort_keys=True).encode()}
+
+
+def fly(plans: Sequence[Plan], board: Board, out: Path) -> dict[str, Path]:
+    """Fly one after the other in one guest; where each left what recorders and tasks wrote, a folder for each task."""
     out.mkdir(parents=True, exist_ok=True)
     measured = subject.build(board)
     initrd = out / "initrd.img"
-    commands = {"flight": ["python3", f"{DIRECTORY}/fly.py", f"{DIRECTORY}/flight.json"]}
+    commands = {"session": ["python3", f"{DIRECTORY}/fly.py", f"{DIRECTORY}/session.json"]}
     keys = out / "keys"
     keys.mkdir(exist_ok=True)
-    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, files(plan, board, keys))
+    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, files(plans, board, keys))
     guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=RELAYS)
-    document = results.received(guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * plan.seconds))
+    seconds = sum(plan.seconds for plan in plans)
+    document = results.received(guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds))
     initrd.unlink()
-    flight = json.loads(document["commands"]["flight"])
-    if "error" in flight:
-        raise UserError(f"the flight failed in the guest:\n{flight['error'].strip()}")
-    left = out / "flight"
-    for name, content in flight["files"].items():
-        (left / name).parent.mkdir(parents=True, exist_ok=True)
-        (left / name).write_bytes(base64.b64decode(content))
-    (left / "statuses.json").write_text(json.dumps(flight["statuses"], indent=1))
-    return left
+    said = json.loads(document["commands"]["session"])
+    for name, content in said["files"].items():
+        file = out / "flights" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(base64.b64decode(content))
+    if "error" in said:
+        raise UserError(f"the flight failed in the guest:\n{said['error'].strip()}")
+    return {plan.name: out / "flights" / plan.name for plan in plans}

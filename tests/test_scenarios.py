@@ -1,0 +1,179 @@
+"""A floating robot whose control is spread over four computers flies in virtual time, and what happens when it cannot.
+
+The published experiment: navigation, control and thruster mapping on three computers, sensors and valves on a fourth,
+100 Hz, everything across the ad hoc network four times within a period; then the link is cut with valves closed (it
+drifts) and open (it spun). All flights are of one guest; `make scenarios` flies the square in its full size.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from images.builder.fleet import Board, Fleet
+from tests.scenarios import virtual
+from tests.scenarios.flight import HOPS, Flight
+from tests.scenarios.virtual import Event, Plan
+
+pytestmark = pytest.mark.boot
+
+SIDE_M = 0.1
+PERIOD_US = 10_000
+
+# Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm, heading
+# within 0.65°, thrusters 33 s of 400 s.
+RMS_M = 0.02
+HEADING_RAD = math.radians(1)
+ON_TIME_SHARE = 0.1
+SWITCHES_PER_S = 4
+
+TIMEOUT_S = 0.15
+"""Until valves without good commands are closed: 0.05 s until a message is old, 0.1 s of the relay board's block."""
+RECORD_S = 0.05
+"""Between two records of the plant."""
+
+SPIN_RAD_S = 2.0
+"""With so much the thrusters have to turn for four seconds."""
+CUT_S = 2.5
+CUT = (Event.on(CUT_S, "robot1", "iw", "dev", "wlan0", "ibss", "leave"),)
+LOSS = [
+    Event.on(0, f"robot{n}", "tc", "qdisc", "add", "dev", "wlan0", "root", "netem", "loss", "10%") for n in range(1, 5)
+]
+
+PLANS = (
+    virtual.square("udp", SIDE_M),
+    virtual.square("dds", SIDE_M, transport="dds"),
+    virtual.square("loss", SIDE_M, events=LOSS),
+    Plan("cut-closed", 8, events=CUT, plant={"initial_velocity": [0.01, 0, 0]}),
+    Plan("cut-open", 8, events=CUT, plant={"initial_velocity": [0, 0, SPIN_RAD_S]}),
+    Plan("cut-open-no-timeout", 8, events=CUT, plant={"initial_velocity": [0, 0, SPIN_RAD_S]},
+         changes={"valves.relays.timeout": 60}),
+)  # fmt: skip
+REPEATED = (virtual.square("udp", 0.01), virtual.square("dds", 0.01, transport="dds"))
+
+
+@pytest.fixture(scope="module")
+def board(fleet: Fleet) -> Board:
+    return fleet.boards["smartcoret3"].model_copy(update={"kernel": "lean"})
+
+
+@pytest.fixture(scope="module")
+def flights(board: Board, session_artefacts: Path) -> Callable[[str], Flight]:
+    directories = virtual.fly(PLANS, board, session_artefacts / "scenarios")
+    flown = {name: Flight(directory) for name, directory in directories.items()}
+    return lambda name: flown[name]
+
+
+@pytest.mark.parametrize("name", ["udp", "dds", "loss"])
+def test_the_square_is_flown(flights: Callable[[str], Flight], name: str) -> None:
+    """Seen to fail with a filter that does not know the thrusters' force: 552 switches in 60 s."""
+    flight = flights(name)
+    seconds = 4 * SIDE_M / 0.01
+    error, thrusters = flight.error(), flight.thrusters()
+    print(f"{name}: RMS {error.rms_m * 1000:.1f} mm, at most {error.max_m * 1000:.1f} mm")
+    print(f"{name}: heading within {math.degrees(error.max_heading_rad):.2f}°")
+    print(f"{name}: thrusters {thrusters.on_time_s:.2f} s, {thrusters.switches} switches")
+    assert flight.completed
+    assert error.rms_m <= RMS_M
+    assert error.max_heading_rad <= HEADING_RAD
+    assert thrusters.on_time_s <= ON_TIME_SHARE * seconds
+    assert thrusters.switches <= SWITCHES_PER_S * seconds
+
+
+@pytest.mark.parametrize("name", ["udp", "dds"])
+def test_four_hops_take_less_than_a_period(flights: Callable[[str], Flight], name: str) -> None:
+    flight = flights(name)
+    for index, hop in enumerate(HOPS):
+        latency = flight.hop(index)
+        print(f"{name}: {hop}: {latency.min_us} to {latency.max_us} µs, mean {latency.mean_us:.0f}")
+    latency = flight.latency()
+    print(f"{name}: four hops: {latency.min_us} to {latency.max_us} µs, mean {latency.mean_us:.0f}")
+    print(f"{name}: percentiles {latency.percentiles_us}")
+    on_time = sum(count for us, count in latency.histogram_us.items() if us < PERIOD_US)
+    assert on_time >= 0.999 * latency.samples
+    assert flight.lost() == 0
+
+
+def test_what_the_network_loses_is_lost_and_no_more(flights: Callable[[str], Flight]) -> None:
+    """Four hops, each with nine of ten: about two thirds arrive."""
+    flight = flights("loss")
+    share = flight.lost() / (flight.lost() + len(flight.arrived))
+    print(f"lost {share:.1%}")
+    assert abs(share - (1 - 0.9**4)) < 0.04
+
+
+def velocities(flight: Flight) -> list[tuple[float, float, float]]:
+    """From when the valves have to be closed."""
+    return [record["velocity"] for record in flight.since(flight.events_ns[0] + round((TIMEOUT_S + RECORD_S) * 1e9))]
+
+
+def on_times(flight: Flight) -> list[float]:
+    return [
+        sum(record["on_time"]) for record in flight.since(flight.events_ns[0] + round((TIMEOUT_S + RECORD_S) * 1e9))
+    ]
+
+
+@pytest.mark.parametrize("name", ["cut-closed", "cut-open"])
+def test_a_cut_link_ends_in_a_drift(flights: Callable[[str], Flight], name: str) -> None:
+    flight = flights(name)
+    (before,) = flight.since(flight.events_ns[0])[:1]
+    after = on_times(flight)
+    assert len(after) > 50, "the flight ends too early"
+    assert min(after) == max(after), "a valve is open after the time-out"
+    rates = {velocity[2] for velocity in velocities(flight)}
+    print(f"{name}: {before['velocity'][2]:.4f} rad/s when the link was cut, {sorted(rates)} afterwards")
+    assert len(rates) == 1
+    assert abs(rates.pop()) <= abs(before["velocity"][2]) + 0.001
+
+
+def test_valves_are_open_when_the_link_is_cut(flights: Callable[[str], Flight]) -> None:
+    """Otherwise the test above would show nothing."""
+    flight = flights("cut-open")
+    just_before = [record for record in flight.flown if record["time_ns"] < flight.events_ns[0]][-3:]
+    times = [sum(record["on_time"]) for record in just_before]
+    assert times[0] < times[1] < times[2]
+
+
+def test_without_the_time_out_it_spins(flights: Callable[[str], Flight]) -> None:
+    """The published third test, and the negative control of the two above."""
+    rates = [velocity[2] for velocity in velocities(flights("cut-open-no-timeout"))]
+    print(f"from {rates[0]:.2f} to {rates[-1]:.2f} rad/s")
+    assert rates[-1] < -1, "it was turning the other way, and is driven on"
+
+
+@contextmanager
+def loaded_host() -> Iterator[None]:
+    """Both, or all, processors have something else to do."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for each in busy:
+            each.kill()
+            each.wait()
+
+
+def test_flights_repeat_to_the_byte(board: Board, artefacts: Path) -> None:
+    """Once on a loaded host. Seen to fail with another seed of the plant's noise."""
+
+    def left(name: str) -> dict[str, bytes]:
+        flights = virtual.fly(REPEATED, board, artefacts / name)
+        return {
+            f"{flight}/{path.relative_to(directory)}": path.read_bytes()
+            for flight, directory in flights.items()
+            for path in sorted(directory.rglob("*"))
+            if path.is_file()
+        }
+
+    first = left("first")
+    with loaded_host():
+        second = left("second")
+    assert first.keys() == second.keys()
+    assert [name for name in first if first[name] != second[name]] == []
