@@ -27,8 +27,8 @@ pytestmark = pytest.mark.boot
 SIDE_M = 0.1
 PERIOD_US = 10_000
 
-# Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm, heading
-# within 0.65°, thrusters 33 s of 400 s.
+# Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm,
+# heading within 0.65°, thrusters 33 s of 400 s.
 RMS_M = 0.02
 HEADING_RAD = math.radians(1)
 ON_TIME_SHARE = 0.1

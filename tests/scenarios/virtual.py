@@ -30,6 +30,8 @@ DIRECTORY = subject.DIRECTORY
 STATION = "station"
 RELAYS = ("-chardev", "null,id=relays", "-device", "isa-parallel,iobase=0x300,chardev=relays")
 """What can be written and read back at the relay board's first register: a printer port's data register."""
+MEMORY_MIB = 768
+"""Of the guest, which is five computers."""
 _BOOT_LIMIT_S = 600
 _LIMIT_PER_SECOND = 10
 """Of the host's clock, for each virtual second: finite, and generous to a busy host."""
@@ -95,7 +97,8 @@ def _changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
     for key, value in own.items():
         block, parameter = key.split(".")
         task["blocks"][block]["parameters"][parameter] = value
-    return bytes(yaml.safe_dump(task, encoding="utf-8"))
+    changed: bytes = yaml.safe_dump(task, encoding="utf-8")
+    return changed
 
 
 def _plant(plan: Plan, robot_address: str, gyro: str) -> bytes:
@@ -163,6 +166,7 @@ def fly(plans: Sequence[Plan], board: Board, out: Path) -> dict[str, Path]:
     """Fly one after the other in one guest; where each left what recorders and tasks wrote, a folder for each task."""
     out.mkdir(parents=True, exist_ok=True)
     measured = subject.build(board)
+    board = board.model_copy(update={"qemu": board.qemu.model_copy(update={"memory_mib": MEMORY_MIB})})
     initrd = out / "initrd.img"
     commands = {"session": ["python3", f"{DIRECTORY}/fly.py", f"{DIRECTORY}/session.json"]}
     keys = out / "keys"
