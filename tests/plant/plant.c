@@ -27,12 +27,12 @@ const struct plant_range plant_ranges[] = {
     RANGE(minimum_on_time, "s", false, 0, 10),
     RANGE(opening_delay, "s", false, 0, 10),
     RANGE(closing_delay, "s", false, 0, 10),
-    RANGE(tilt, "m/s²", false, -10, 10),
+    RANGE(tilt, "m/s²", true, -10, 10),
     RANGE(igps_noise, "m", false, 0, 10),
     RANGE(gyro_noise_deg_s, "°/s", false, 0, 375),
     RANGE(gyro_bias_deg_s, "°/s", false, -375, 375),
-    RANGE(initial_pose, "m, m, rad", false, -1e3, 1e3),
-    RANGE(initial_velocity, "m/s, m/s, rad/s", false, -100, 100),
+    RANGE(initial_pose, "m, m, rad", true, -1e3, 1e3),
+    RANGE(initial_velocity, "m/s, m/s, rad/s", true, -100, 100),
     RANGE(seed, "", false, 0, LARGEST_SEED),
 };
 const uint32_t plant_range_count = sizeof plant_ranges / sizeof plant_ranges[0];
