@@ -4,13 +4,13 @@
  *
  * World axes are the table's, the heading turns from x to y (counter-clockwise seen from above) and is not wrapped.
  * SI units throughout, but for the gyro's °/s; time is counted in whole nanoseconds, so that valves switch at the same
- * instants on every processor. Random numbers, too, are the same everywhere; motion differs between processors by the
- * rounding of sin and cos.
+ * instants on every processor. Random numbers, too, are the same everywhere; motion differs between processors by
+ * rounding alone (i386 from amd64 by 1e-12 in some minutes).
  *
- * No I/O, no globals, no allocation: a plant is one structure of the caller's. It is used by blocks (blocks.c) and by
- * Python (plant.py), which reads names, counts and units of the parameters from `plant_ranges`.
+ * No I/O, no globals, no allocation: a plant is one structure of the caller's. It is used by a block
+ * (floating_robot.c) and by Python (plant.py), which read names and counts of the parameters from `plant_ranges`.
  *
- * Source of the model and of the figures in floating_robot.yml: the published floating spacecraft simulators.
+ * The model is that of the published floating spacecraft simulators; floating_robot.yml says which figures are theirs.
  */
 #ifndef PLANT_H
 #define PLANT_H
