@@ -632,6 +632,7 @@ def dds(pentium: RobotGuest, fleet: Fleet) -> dict[str, Any]:
         (r"<MaxAutoParticipantIndex>.*?<", "<MaxAutoParticipantIndex>3<"),
         (r"(?s)<Peers>.*?</Peers>", f'<Peers><Peer Address="{pentium.robot.address}"/></Peers>'),
         (r"<MultipleReceiveThreads>.*?<", "<MultipleReceiveThreads>true<"),
+        (r"(?s)<Threads>.*?</Threads>", ""),
     )
     alone = _edited(
         shipped,
@@ -664,9 +665,11 @@ def _dds_case(option: str, read: Callable[[dict[str, Any]], object], expected: o
         _dds_case("MaxMessageSize", lambda run: 1000 < run["largest"] <= 1400, True),
         _dds_case("FragmentSize", lambda run: run["fragments"], [1300]),
         _dds_case("ParticipantIndex", lambda run: {0, 1, 2, 3} <= set(run["bound"]), True, "alone"),
-        _dds_case("MaxAutoParticipantIndex", lambda run: len({p for a, p in run["sent"] if p >= 10 and p % 2 == 0}), 9),
+        _dds_case("MaxAutoParticipantIndex", lambda run: len({p for a, p in run["sent"] if p >= 10 and p % 2 == 0}), 5),
         _dds_case("Peers", lambda run: sorted({peer for peer, _ in run["sent"]}), "everyone"),
         _dds_case("MultipleReceiveThreads", lambda run: sorted(set(run["threads"]) & {"recvMC", "recvUC"}), []),
+        _dds_case("Scheduling", lambda run: run["real_time"], {"recv": 60}),
+        _dds_case("StackSize", lambda run: run["stacks"] >= 5, True),
         _dds_case("SocketReceiveBufferSize", lambda run: run["ended"], [None, None], "greedy"),
     ],
 )
@@ -750,6 +753,13 @@ def observe_dds(configuration: str, domain: int, processes: int, seconds: float)
         found["ended"] = [process.poll() for process, _ in running]
         tasks = [path for process, _ in running for path in Path(f"/proc/{process.pid}/task").glob("*/comm")]
         found["threads"] = sorted({path.read_text().strip() for path in tasks})
+        after = {path: path.with_name("stat").read_text().rpartition(")")[2].split() for path in tasks}  # proc(5)
+        found["real_time"] = {
+            path.read_text().strip(): int(stat[37]) for path, stat in after.items() if stat[37] != "0"
+        }
+        maps = [line for process, _ in running for line in Path(f"/proc/{process.pid}/maps").read_text().splitlines()]
+        spans = [line.split()[0].split("-") for line in maps if " rw-p 00000000 00:00 0" in line]
+        found["stacks"] = sum(int(end, 16) - int(begin, 16) == 256 << 10 for begin, end in spans)
         groups = re.findall(r"^\t+([0-9A-F]{8}) ", Path("/proc/net/igmp").read_text(), re.M)
         found["groups"] = sorted({socket.inet_ntoa(struct.pack("=I", int(group, 16))) for group in groups})
         bound = re.findall(r":(\d+) +\S+ +users:\(\(\"ddsperf", shown("ss", "-Huanp"))

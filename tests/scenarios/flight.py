@@ -32,10 +32,11 @@ class Error:
 
 @dataclass(frozen=True)
 class Thrusters:
-    """What the valves did, over the whole flight: latency shows here before it shows in the error."""
+    """What the valves did while the path was flown: latency shows here before it shows in the error."""
 
     on_time_s: float
-    switches: int
+    """Of all together."""
+    firings: int
 
 
 class Flight:
@@ -94,8 +95,10 @@ class Flight:
         return Error(rms, max(errors), max(headings))
 
     def thrusters(self) -> Thrusters:
-        last = self.flown[-1]
-        return Thrusters(sum(last["on_time"]), sum(last["switches"]))
+        begin, end = (self.since(self.commanded[index]["time_ns"])[0] for index in (0, -1))
+        return Thrusters(
+            sum(end["on_time"]) - sum(begin["on_time"]), (sum(end["switches"]) - sum(begin["switches"])) // 2
+        )
 
     def hop(self, index: int) -> Latency:
         """From one task's release to the next one's, in which the former's step lies."""

@@ -90,6 +90,8 @@ def main(session: dict[str, Any], out: Path) -> dict[str, Any]:
             Path(link).unlink(missing_ok=True)
             Path(link).symlink_to(device)
         join_cell(session["computers"])
+        for task in session["safe"]:  # as a relay board is after power on
+            run("flotilla-run", "--safe", task)
         for flight in session["flights"]:
             fly(flight, out / flight["name"])
             for computer in session["computers"]:

@@ -97,8 +97,7 @@ def _changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
     for key, value in own.items():
         block, parameter = key.split(".")
         task["blocks"][block]["parameters"][parameter] = value
-    changed: bytes = yaml.safe_dump(task, encoding="utf-8")
-    return changed
+    return str(yaml.safe_dump(task)).encode()
 
 
 def _plant(plan: Plan, robot_address: str, gyro: str) -> bytes:
@@ -157,6 +156,7 @@ def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
     session = {
         "computers": [{"name": host.name, "address": f"{host.address}/{length}"} for host in hosts],
         "links": {"/dev/robot/gyro": gyro_device(described, board), "/etc/flotilla/ibss.conf": cell},
+        "safe": [f"{DIRECTORY}/{plans[0].name}/valves.yml"],
         "flights": flights,
     }
     return there | {f"{DIRECTORY}/session.json": json.dumps(session, sort_keys=True).encode()}

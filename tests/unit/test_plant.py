@@ -19,7 +19,7 @@ import pytest
 from images.builder.errors import UserError
 from tests.plant.plant import ROBOT, THRUSTERS, Plant, library
 
-MASS, INERTIA, FORCE, ARM = 10.5, 0.063, 0.16, 0.1
+MASS, INERTIA, FORCE, ARM = 10.5, 0.063, 0.16, 0.05
 IDEAL: dict[str, Any] = {
     "thrust_noise": 0,
     "minimum_on_time": 0,
