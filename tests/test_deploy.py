@@ -168,7 +168,7 @@ blocks:
 
 
 def test_a_step_that_spins_without_end_is_ended_until_it_is_given_up(bench: Bench) -> None:
-    """On one processor nothing else runs meanwhile. Seen to fail with the guard at ordinary priority: nobody answers."""
+    """On one processor nothing else runs meanwhile."""
     directory = bench.new("block", "spinning")
     source = directory / "spinning.c"
     source.write_text(source.read_text().replace("*phase +=", "while (block->step > 20)\n        ;\n    *phase +="))

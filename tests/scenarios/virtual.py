@@ -103,7 +103,8 @@ def _changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
 def _plant(plan: Plan, robot_address: str, gyro: str) -> bytes:
     parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
     template = jinja2.Template((HERE / "plant.yml.j2").read_text(), undefined=jinja2.StrictUndefined)
-    return template.render(parameters=parameters, robot_address=robot_address, gyro=gyro).encode()
+    text: str = template.render(parameters=parameters, robot_address=robot_address, gyro=gyro)
+    return text.encode()
 
 
 def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
