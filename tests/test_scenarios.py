@@ -35,7 +35,7 @@ then who is there, for five computers at once, and all are the guest's one proce
 RMS_M = 0.02
 HEADING_RAD = math.radians(1)
 ON_TIME_S = 2 * 8 * 10.5 * 0.01 / 0.16
-"""Of all valves: twice what it takes to start, to turn at corners and to stop, eight changes of a velocity by 1 cm/s."""
+"""Of all valves: twice what starting, turning at corners and stopping take, eight changes of a velocity by 1 cm/s."""
 FIRINGS_PER_S = 2
 
 TIMEOUT_S = 0.15
