@@ -46,6 +46,25 @@ def test_tasks_start_with_the_robot(fleet: Fleet) -> None:
     assert "period: 10 ms" in _text(fleet, fleet.robots[1], "/etc/flotilla/tasks/heading.yml")
 
 
+def test_a_task_talks_to_the_one_robot_that_has_the_other(fleet: Fleet) -> None:
+    def rendered(tasks: dict[int, list[str]], transport: str) -> str:
+        robots = {number: fleet.robots[number].model_copy(update={"control_tasks": tasks[number]}) for number in tasks}
+        network = fleet.network.model_copy(update={"transport": transport})
+        several = fleet.model_copy(update={"robots": robots, "network": network})
+        return _text(several, robots[3], "/etc/flotilla/tasks/sensors.yml")
+
+    two = {3: ["sensors"], 4: ["navigation"]}
+    assert (
+        f"type: udp-send\n    in: {{ data: message.out }}\n    parameters: {{ address: {fleet.robots[4].address},"
+        in (rendered(two, "udp"))
+    )
+    assert "type: dds-publish\n" in rendered(two, "dds")
+    for number, words in {1: "robot4 and robot1 has it", 4: "no robot has it"}.items():
+        tasks = {3: ["sensors"], 4: ["navigation"], 1: []} | {number: ["navigation"] if number == 1 else []}
+        with pytest.raises(UserError, match=rf"sensors\.yml: control task navigation: {words}"):
+            rendered(tasks, "udp")
+
+
 def test_rendering_repeats(fleet: Fleet) -> None:
     assert identity.render(fleet, fleet.robots[3]) == identity.render(fleet, fleet.robots[3])
 

@@ -104,7 +104,7 @@ CASES = {
         ROBOTS, PORT3, PORT3.replace("port:", "prot:"), "robot3.devices.gyro.prot", "not known…mean port?", also=1
     ),
     "no such task": Case(
-        ROBOTS, "[heading]", "[haeding]", "robot1.control_tasks.0", "no file…one of heading", "haeding"
+        ROBOTS, "[heading]", "[haeding]", "robot1.control_tasks.0", "no file…one of control, heading", "haeding"
     ),
     "task twice": Case(ROBOTS, "[heading]", "[heading, heading]", "robot1.control_tasks.1", "already…once", "heading"),
     "task's name": Case(
