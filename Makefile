@@ -91,7 +91,7 @@ test: | setup-tests ## everything: checks, a short fuzzing, images, boots in QEM
 	$(Q)$(MAKE) fuzz SECONDS=3
 	$(Q)$(FLOTILLA) image --all
 	$(Q)$(FLOTILLA) kernel --board smartcoret3
-	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit
+	$(Q)$(PYTHON) -m tests
 
 bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
@@ -134,7 +134,7 @@ param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=headin
 	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))
 
 ##@ Real time
-.PHONY: latency latency-accept boot-time hwcheck
+.PHONY: latency latency-accept boot-time hwcheck scenarios
 LATENCY = $(PYTHON) -m tests.latency
 # What is measured: the board's shipped system, or another kernel of it, or less of it, or a robot.
 measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--plan $(PLAN))
@@ -150,6 +150,9 @@ latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and make that
 
 boot-time: | setup-tests ## where a boot spends its time, in virtual time
 	$(Q)$(LATENCY) boot-time $(measured)
+
+scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=1] [FLIGHTS="udp dds"]
+	$(Q)$(PYTHON) -m tests.scenarios $(if $(SIDE),--side $(SIDE)) $(FLIGHTS)
 
 ##@ Housekeeping
 .PHONY: setup setup-tests clean help

@@ -2,47 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import os
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from images.builder.boot import DIE_WITH_PARENT
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
-from tests.conftest import GuestFactory
-from tests.latency import boottime, gate, machine, report, run, subject, target
+from tests.lab.busy_host import busy_host
+from tests.latency import boottime, gate, machine, run, subject
 from tests.latency.controls import DELAY_US, Control
 from tests.latency.results import Latency, Results
 
-pytestmark = pytest.mark.boot
+pytestmark = [pytest.mark.boot, pytest.mark.virtual_time]
 
 BOARD = "smartcoret3"
 KERNELS = ("lean", "debian")
 FIRST_STEP_S = 8.0
 """A control task has its first period within this virtual time from the boot loader's end."""
-
-
-@contextlib.contextmanager
-def busy_host() -> Iterator[None]:
-    """A process for each processor that only computes, for as long as the body takes.
-
-    It is nice: QEMU's two threads hand over thousands of times a second, and would take ten times as long, not twice.
-    """
-    argv = [*DIE_WITH_PARENT, "nice", "-n", "10", sys.executable, "-c", "while True: pass"]
-    hogs = [subprocess.Popen(argv) for _ in range(os.cpu_count() or 1)]
-    try:
-        yield
-        assert [hog.poll() for hog in hogs] == [None] * len(hogs), "the host was not busy all the time"
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
 
 
 @pytest.fixture(scope="module")
@@ -141,22 +119,6 @@ def test_a_control_task_begins_soon_after_power_on(boards: dict[str, Board], art
     print(boottime.account(boots))
     assert boots.card["boot"]["failed_units"] == []
     assert boots.first_step_s <= FIRST_STEP_S
-
-
-def test_the_same_scenarios_on_a_robot_in_real_time(
-    guest: GuestFactory, fleet: Fleet, artefacts: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A guest stands in for the robot. How late it is depends on this host and is not judged."""
-    monkeypatch.setitem(run.SECONDS, "quick", 1)
-    robot = guest(3)
-    found = target.measure(robot.robot, fleet.boards[robot.robot.board], robot.shell, "quick", artefacts)
-    samples = {
-        name: outcome.latencies[next(iter(outcome.latencies))].samples for name, outcome in found.scenarios.items()
-    }
-    assert samples == {"idle": 1000, "scheduler": 1000, "timerlat-everything": 167, "uart-own": 33}
-    assert "real time" in (report.write([found], artefacts)).read_text()
-    left = robot.shell.run(["ls", "/run/latency", "/dev/robot/uart_own"], check=False)
-    assert left.stderr.count("No such file") == 2, left.stdout
 
 
 def test_a_guest_that_does_not_end_is_ended(boards: dict[str, Board], tmp_path: Path) -> None:

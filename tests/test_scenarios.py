@@ -7,22 +7,21 @@ drifts) and open (it spun). All flights are of one guest; `make scenarios` flies
 
 from __future__ import annotations
 
+import json
 import math
-import os
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from images.builder.fleet import Board, Fleet
-from tests.scenarios import virtual
+from tests.lab.busy_host import busy_host
+from tests.scenarios import report, virtual
 from tests.scenarios.flight import HOPS, Flight
-from tests.scenarios.virtual import Event, Plan
+from tests.scenarios.plans import plans
 
-pytestmark = pytest.mark.boot
+pytestmark = [pytest.mark.boot, pytest.mark.virtual_time]
 
 SIDE_M = 0.1
 PERIOD_US = 10_000
@@ -43,24 +42,10 @@ TIMEOUT_S = 0.15
 RECORD_S = 0.05
 """Between two records of the plant."""
 
-SPIN_RAD_S = 1.0
-"""With so much the thrusters have to turn for four seconds."""
-CUT_S = 2.5
-CUT = (Event.on(CUT_S, "robot1", "iw", "dev", "wlan0", "ibss", "leave"),)
-LOSS = [
-    Event.on(0, f"robot{n}", "tc", "qdisc", "add", "dev", "wlan0", "root", "netem", "loss", "10%") for n in range(1, 5)
-]
-
-PLANS = (
-    virtual.square("udp", SIDE_M),
-    virtual.square("dds", SIDE_M, transport="dds"),
-    virtual.square("loss", SIDE_M, events=LOSS),
-    Plan("cut-closed", 8, events=CUT, plant={"initial_velocity": [0.01, 0, 0]}),
-    Plan("cut-open", 8, events=CUT, plant={"initial_velocity": [0, 0, SPIN_RAD_S]}),
-    Plan("cut-open-no-timeout", 8, events=CUT, plant={"initial_velocity": [0, 0, SPIN_RAD_S]},
-         changes={"valves.relays.timeout": 60}),
-)  # fmt: skip
-REPEATED = (virtual.square("udp", 0.01), virtual.square("dds", 0.01, transport="dds"))
+REPEATED = (
+    virtual.square("udp", "by UDP", 0.01),
+    virtual.square("dds", "by DDS", 0.01, transport="dds"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +54,13 @@ def board(fleet: Fleet) -> Board:
 
 
 @pytest.fixture(scope="module")
-def flights(board: Board, session_artefacts: Path) -> Callable[[str], Flight]:
-    directories = virtual.fly(PLANS, board, session_artefacts / "scenarios")
-    flown = {name: Flight(directory) for name, directory in directories.items()}
+def flown(board: Board, session_artefacts: Path) -> dict[str, Flight]:
+    directories = virtual.fly(plans(SIDE_M), board, session_artefacts / "scenarios")
+    return {name: Flight(directory) for name, directory in directories.items()}
+
+
+@pytest.fixture(scope="module")
+def flights(flown: dict[str, Flight]) -> Callable[[str], Flight]:
     return lambda name: flown[name]
 
 
@@ -153,16 +142,17 @@ def test_without_the_time_out_it_spins(flights: Callable[[str], Flight]) -> None
     assert rates[-1] < rates[0] - 1, "it was to be stopped, and is driven on"
 
 
-@contextmanager
-def loaded_host() -> Iterator[None]:
-    """Both, or all, processors have something else to do."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
-    try:
-        yield
-    finally:
-        for each in busy:
-            each.kill()
-            each.wait()
+def test_the_report_shows_every_flight(flown: dict[str, Flight], session_artefacts: Path) -> None:
+    """Its pages are among the artefacts, to be looked at."""
+    titles = {plan.name: plan.title for plan in plans(SIDE_M)}
+    page = report.write({titles[name]: flight for name, flight in flown.items()}, session_artefacts)
+    text = page.read_text()
+    assert all(f"<h2>{title}</h2>" in text for title in titles.values())
+    assert text.count("<svg") == text.count("</svg>") >= 2 * len(flown)
+    assert not re.search(r"(src|href)=.(?!#)", text), "the page needs something from elsewhere"
+    figures = json.loads((session_artefacts / "scenarios.json").read_text())
+    assert figures[titles["udp"]]["lost"] == 0
+    assert figures[titles["udp"]]["rms_m"] == flown["udp"].error().rms_m
 
 
 def test_flights_repeat_to_the_byte(board: Board, artefacts: Path) -> None:
@@ -178,7 +168,7 @@ def test_flights_repeat_to_the_byte(board: Board, artefacts: Path) -> None:
         }
 
     first = left("first")
-    with loaded_host():
+    with busy_host():
         second = left("second")
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []

@@ -56,6 +56,7 @@ class Plan:
     """A flight."""
 
     name: str
+    title: str
     seconds: float
     """Of virtual time, from the start of the tasks to their end."""
     transport: str = "udp"
@@ -66,10 +67,10 @@ class Plan:
     """Parameters of control tasks that are not those of their files, by `task.block.parameter`."""
 
 
-def square(name: str, side_m: float, **more: Any) -> Plan:
+def square(name: str, title: str, side_m: float, **more: Any) -> Plan:
     """Once around a square at 1 cm/s, as published (there 1 m), after some seconds for the tasks to begin."""
     corners = [0, 0, side_m, 0, side_m, side_m, 0, side_m, 0, 0]
-    return replace(Plan(name, 4 * side_m / 0.01 + 6, changes={"control.path.waypoints": corners}), **more)
+    return replace(Plan(name, title, 4 * side_m / 0.01 + 6, changes={"control.path.waypoints": corners}), **more)
 
 
 def fleet(transport: str) -> Fleet:

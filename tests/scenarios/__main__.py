@@ -1,0 +1,54 @@
+"""Command line: `python -m tests.scenarios`, called by `make scenarios`."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+
+from images.builder import inventory, paths, progress
+from images.builder.errors import UserError
+from tests.scenarios import report, virtual
+from tests.scenarios.flight import Flight
+from tests.scenarios.plans import SIDE_M, plans
+
+OUT = paths.BUILD / "scenarios"
+
+
+def _fly(names: list[str], side_m: float) -> None:
+    there = {plan.name: plan for plan in plans(side_m)}
+    for name in names:
+        if name not in there:
+            raise UserError(f"{name}: there is no such flight; there are {', '.join(there)}")
+    chosen = [there[name] for name in names or there]
+    board = inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
+    shutil.rmtree(OUT, ignore_errors=True)
+    seconds = sum(plan.seconds for plan in chosen)
+    with progress.step(f"{len(chosen)} flights, {seconds:g} virtual seconds"):
+        directories = virtual.fly(chosen, board, OUT)
+    page = report.write(
+        {there[name].title: Flight(directory) for name, directory in directories.items()}, paths.BUILD / "reports"
+    )
+    print(f"{paths.shown(page)}; what each task said and recorded: {paths.shown(OUT)}/flights")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.scenarios", description="Flights in virtual time.")
+    parser.add_argument("flights", nargs="*", help="names; without, all")
+    parser.add_argument("--side", type=float, default=SIDE_M, metavar="M", help="of the square (%(default)s m)")
+    arguments = parser.parse_args()
+    try:
+        if not 0.01 <= arguments.side <= 10:
+            raise UserError(f"--side {arguments.side:g}: is not from 0.01 to 10 m")
+        _fly(arguments.flights, arguments.side)
+    except UserError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,30 @@
+"""The flights: the published experiment's three tests, and what it did not try."""
+
+from __future__ import annotations
+
+from tests.scenarios.virtual import Event, Plan, square
+
+SIDE_M = 1.0
+"""Of the published square, flown at 1 cm/s."""
+CUT_S = 2.5
+_CUT = (Event.on(CUT_S, "robot1", "iw", "dev", "wlan0", "ibss", "leave"),)
+_LOSS = tuple(
+    Event.on(0, f"robot{number}", "tc", "qdisc", "add", "dev", "wlan0", "root", "netem", "loss", "10%")
+    for number in range(1, 5)
+)
+_SPIN = {"initial_velocity": [0, 0, 1]}
+"""With 1 rad/s the thrusters have to turn for four seconds: they do when the link is cut."""
+
+
+def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
+    return (
+        square("udp", "the square, by UDP", side_m),
+        square("dds", "the square, by DDS", side_m, transport="dds"),
+        square("loss", "the square, each radio losing a tenth", side_m, events=_LOSS),
+        Plan("cut-closed", "the link cut, valves closed", 8, events=_CUT, plant={"initial_velocity": [0.01, 0, 0]}),
+        Plan("cut-open", "the link cut, valves open", 8, events=_CUT, plant=_SPIN),
+        Plan(
+            "cut-open-no-timeout", "the link cut, valves open, without a time-out", 8, events=_CUT, plant=_SPIN,
+            changes={"valves.relays.timeout": 60},
+        ),
+    )  # fmt: skip
