@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -57,20 +58,57 @@ def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
         return subprocess.Popen([*argv, task["file"]], stdout=log, stderr=log, env=environment, cwd=out)
 
 
+class Flight:
+    """Tasks that run, and what may happen to them."""
+
+    def __init__(self, tasks: list[dict[str, str]], out: Path) -> None:
+        self.tasks, self.out = tasks, out
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.actions: dict[str, Callable[..., None]] = {
+            "run": run,
+            "power-off": self.power_off,
+            "power-on": self.power_on,
+        }
+        for task in tasks:
+            self.start(task)
+
+    def start(self, task: dict[str, str], again: str = "") -> None:
+        self.running[task["name"]] = start(task, self.out / (task["name"] + again))
+
+    def power_off(self, computer: str) -> None:
+        """Its tasks stop at any instruction, and its radio is silent."""
+        for task in self.tasks:
+            if task["computer"] == computer:
+                self.running[task["name"]].kill()
+                self.running.pop(task["name"]).wait(_END_S)
+        run("ip", "netns", "exec", computer, "iw", "dev", "wlan0", "ibss", "leave")
+
+    def power_on(self, computer: str) -> None:
+        """As after a boot: into the cell, and all tasks from the beginning. At most once in a flight."""
+        join(computer)
+        for task in self.tasks:
+            if task["computer"] == computer:
+                self.start(task, "-again")
+
+    def end(self) -> dict[str, int]:
+        """The status of each task, which was asked to end."""
+        for task in self.running.values():
+            task.send_signal(signal.SIGTERM)
+        return {name: task.wait(_END_S) for name, task in self.running.items()}
+
+
 def fly(flight: dict[str, Any], out: Path) -> None:
     """Start the tasks, let things happen to them, end them; each has to end as asked."""
     begin = time.monotonic()
     happened: list[int] = []
-    tasks = {task["name"]: start(task, out / task["name"]) for task in flight["tasks"]}
+    tasks = Flight(flight["tasks"], out)
     for event in sorted(flight["events"], key=lambda event: float(event["at_s"])):
         time.sleep(max(0.0, begin + event["at_s"] - time.monotonic()))
-        run(*event["command"])
+        tasks.actions[event["action"]](*event["arguments"])
         happened.append(time.monotonic_ns())
     (out / "events.json").write_text(json.dumps(happened))
     time.sleep(max(0.0, begin + flight["seconds"] - time.monotonic()))
-    for task in tasks.values():
-        task.send_signal(signal.SIGTERM)
-    statuses = {name: task.wait(_END_S) for name, task in tasks.items()}
+    statuses = tasks.end()
     if any(statuses.values()):
         raise RuntimeError(f"{flight['name']}: tasks ended with {statuses}")
 

@@ -12,6 +12,18 @@ _LOSS = tuple(
     Event.on(0, f"robot{number}", "tc", "qdisc", "add", "dev", "wlan0", "root", "netem", "loss", "10%")
     for number in range(1, 5)
 )
+_DISORDER = tuple(
+    Event.on(
+        0, f"robot{number}", "tc", "qdisc", "add", "dev", "wlan0", "root", "netem",
+        "delay", "2ms", "1ms", "distribution", "normal", "reorder", "20%", "duplicate", "5%",
+    )
+    for number in range(1, 5)
+)  # fmt: skip
+_POWER = (Event(12, "power-off", ["robot4"]), Event(14, "power-on", ["robot4"]))
+_PARTITION = (
+    Event.on(12, "robot3", "iw", "dev", "wlan0", "ibss", "leave"),
+    Event.on(13, "robot3", "/usr/lib/flotilla/ibss", "wlan0"),
+)
 _SPIN = {"initial_velocity": [0, 0, 1]}
 """With 1 rad/s the thrusters have to turn for four seconds: they do when the link is cut."""
 
@@ -21,6 +33,9 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
         square("udp", "the square, by UDP", side_m),
         square("dds", "the square, by DDS", side_m, transport="dds"),
         square("loss", "the square, each radio losing a tenth", side_m, events=_LOSS),
+        square("disorder", "the square, packets late, out of order and twice", side_m, events=_DISORDER),
+        square("partition", "the square, the controller alone for a second", side_m, events=_PARTITION),
+        square("power", "the square, thruster mapping without power for two seconds", side_m, events=_POWER),
         Plan("cut-closed", "the link cut, valves closed", 8, events=_CUT, plant={"initial_velocity": [0.01, 0, 0]}),
         Plan("cut-open", "the link cut, valves open", 8, events=_CUT, plant=_SPIN),
         Plan(

@@ -128,7 +128,7 @@ def _latency(flight: Flight, axes: Axes) -> None:
     axes.stairs(*_bins(flight.latency().histogram_us), label="all four", color="black", linewidth=1.2)
     axes.axvline(10, color=_RED, linewidth=0.8)
     axes.set(title="Latency: the line is the period", xlabel="ms", ylabel="steps", xscale="log", yscale="log")
-    axes.legend()
+    axes.legend(loc="upper right")
 
 
 def _bins(histogram_us: Mapping[int, int]) -> tuple[list[int], list[float]]:

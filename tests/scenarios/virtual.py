@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from unittest import mock
 
 import jinja2
@@ -39,16 +39,17 @@ _LIMIT_PER_SECOND = 10
 
 @dataclass(frozen=True)
 class Event:
-    """A command of the guest, in the midst of a flight."""
+    """What happens in the midst of a flight: a command, or a computer without power until it has it again."""
 
     at_s: float
     """After the start of the tasks."""
-    command: Sequence[str]
+    action: Literal["run", "power-off", "power-on"]
+    arguments: Sequence[str]
 
     @classmethod
     def on(cls, at_s: float, computer: str, *command: str) -> Event:
-        """On one of the computers."""
-        return cls(at_s, ("ip", "netns", "exec", computer, *command))
+        """A command on one of the computers."""
+        return cls(at_s, "run", ("ip", "netns", "exec", computer, *command))
 
 
 @dataclass(frozen=True)
