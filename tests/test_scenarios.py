@@ -35,12 +35,13 @@ RMS_M = 0.02
 HEADING_RAD = math.radians(1)
 ON_TIME_S = 2 * 8 * 10.5 * 0.01 / 0.16
 """Of all valves: twice what starting, turning at corners and stopping take, eight changes of a velocity by 1 cm/s."""
-FIRINGS_PER_S = 2
+FIRINGS_PER_S = 4
 
 TIMEOUT_S = 0.15
 """Until valves without good commands are closed: 0.05 s until a message is old, 0.1 s of the relay board's block."""
 RECORD_S = 0.05
 """Between two records of the plant."""
+TIMEOUT_NS = round((TIMEOUT_S + RECORD_S) * 1e9)
 
 REPEATED = (
     virtual.square("udp", "by UDP", 0.01),
@@ -64,7 +65,7 @@ def flights(flown: dict[str, Flight]) -> Callable[[str], Flight]:
     return lambda name: flown[name]
 
 
-@pytest.mark.parametrize("name", ["udp", "dds", "loss"])
+@pytest.mark.parametrize("name", ["udp", "dds", "loss", "disorder", "partition", "power"])
 def test_the_square_is_flown(flights: Callable[[str], Flight], name: str) -> None:
     """Seen to fail with a filter that does not know the thrusters' force: 276 firings in 60 s."""
     flight = flights(name)
@@ -103,15 +104,24 @@ def test_what_the_network_loses_is_lost_and_no_more(flights: Callable[[str], Fli
     assert abs(share - (1 - 0.9**4)) < 0.04
 
 
+def test_a_computer_without_power_closes_the_valves_until_it_is_back(flights: Callable[[str], Flight]) -> None:
+    """Thruster mapping is gone for two seconds: nothing fires, and nobody has to help when it returns."""
+    flight = flights("power")
+    off_ns, on_ns = flight.events_ns
+    opened = {record["time_ns"]: sum(record["on_time"]) for record in flight.since(off_ns + TIMEOUT_NS)}
+    gone = {opened[time_ns] for time_ns in opened if time_ns < on_ns}
+    assert len(gone) == 1
+    back_ns = next(time_ns for time_ns in opened if opened[time_ns] not in gone)
+    print(f"control resumes {(back_ns - on_ns) / 1e9:.2f} s after the tasks start")
+
+
 def velocities(flight: Flight) -> list[tuple[float, float, float]]:
     """From when the valves have to be closed."""
-    return [record["velocity"] for record in flight.since(flight.events_ns[0] + round((TIMEOUT_S + RECORD_S) * 1e9))]
+    return [record["velocity"] for record in flight.since(flight.events_ns[0] + TIMEOUT_NS)]
 
 
 def on_times(flight: Flight) -> list[float]:
-    return [
-        sum(record["on_time"]) for record in flight.since(flight.events_ns[0] + round((TIMEOUT_S + RECORD_S) * 1e9))
-    ]
+    return [sum(record["on_time"]) for record in flight.since(flight.events_ns[0] + TIMEOUT_NS)]
 
 
 @pytest.mark.parametrize("name", ["cut-closed", "cut-open"])
