@@ -91,7 +91,7 @@ test: | setup-tests ## everything: checks, a short fuzzing, images, boots in QEM
 	$(Q)$(MAKE) fuzz SECONDS=3
 	$(Q)$(FLOTILLA) image --all
 	$(Q)$(FLOTILLA) kernel --board smartcoret3
-	$(Q)$(PYTHON) -m tests
+	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit
 
 bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))

@@ -757,7 +757,8 @@ def observe_dds(configuration: str, domain: int, processes: int, seconds: float)
         found["real_time"] = {
             path.read_text().strip(): int(stat[37]) for path, stat in after.items() if stat[37] != "0"
         }
-        maps = [line for process, _ in running for line in Path(f"/proc/{process.pid}/maps").read_text().splitlines()]
+        there = [Path(f"/proc/{process.pid}/maps") for process, _ in running if process.poll() is None]
+        maps = [line for path in there for line in path.read_text().splitlines()]
         spans = [line.split()[0].split("-") for line in maps if " rw-p 00000000 00:00 0" in line]
         found["stacks"] = sum(int(end, 16) - int(begin, 16) == 256 << 10 for begin, end in spans)
         groups = re.findall(r"^\t+([0-9A-F]{8}) ", Path("/proc/net/igmp").read_text(), re.M)

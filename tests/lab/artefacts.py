@@ -15,10 +15,6 @@ DIRECTORY = paths.BUILD / "test-artefacts"
 _FAILED = pytest.StashKey[bool]()
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--session", default="session", help="directory of session_artefacts (%(default)s)")
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
@@ -48,11 +44,8 @@ def artefacts(request: pytest.FixtureRequest) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def session_artefacts(request: pytest.FixtureRequest) -> Iterator[Path]:
-    """A directory of what many tests share, `build/test-artefacts/session/`: kept when any test failed.
-
-    Sessions at the same time have different names.
-    """
-    directory: Path = DIRECTORY / request.config.getoption("--session")
+    """A directory of what many tests share, `build/test-artefacts/session/`: kept when any test failed."""
+    directory = DIRECTORY / "session"
     shutil.rmtree(directory, ignore_errors=True)
     directory.mkdir(parents=True)
     yield directory
