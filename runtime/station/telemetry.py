@@ -1,0 +1,107 @@
+"""What robots tell the station: found in their control tasks, so that it is described nowhere else.
+
+A stream is a block `udp-send` to a station's address whose data come from a block `pack`: that one's names, types and
+widths are the datagram.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from images.builder import identity
+from images.builder.errors import UserError
+from images.builder.fleet import Fleet
+from runtime.station.recording import CODES, Value
+
+_BYTE_ORDERS = {"little": "<", "big": ">"}
+
+
+@dataclass(frozen=True)
+class Field:
+    name: str
+    type: str
+    """As tasks name it: `boolean`, `int8` to `uint64`, `single`, `double`."""
+    width: int
+    offset: int
+    """Bytes from the datagram's beginning."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Datagrams of one robot's task."""
+
+    robot: str
+    task: str
+    block: str
+    """Which packs them."""
+    address: str
+    """They come from."""
+    port: int
+    """UDP port of the station."""
+    fields: tuple[Field, ...]
+    byte_order: str
+    """Of struct(3): `<` or `>`."""
+    length: int
+    """Bytes of a datagram."""
+
+    @property
+    def topic(self) -> str:
+        """`/robot1/valves/report`."""
+        return f"/{self.robot}/{self.task}/{self.block}"
+
+    def unpack(self, datagram: bytes) -> dict[str, Value]:
+        """Its values by name; the length has to be right."""
+        values: dict[str, Value] = {}
+        for field in self.fields:
+            found = struct.unpack_from(f"{self.byte_order}{field.width}{CODES[field.type]}", datagram, field.offset)
+            values[field.name] = found if field.width > 1 else found[0]
+        return values
+
+
+def streams(fleet: Fleet) -> list[Stream]:
+    """All that reach a station of the fleet; no two may look alike to it."""
+    stations = {str(station.address) for station in fleet.stations}
+    found: dict[tuple[str, int], Stream] = {}
+    for robot in fleet.robots.values():
+        files = identity.render(fleet, robot) if robot.control_tasks else {}
+        for name in robot.control_tasks:
+            task = yaml.load(files[identity.TASKS / f"{name}.yml"][0], yaml.BaseLoader)
+            for stream in of_task(robot.name, str(robot.address), name, task, stations):
+                other = found.setdefault((stream.address, stream.port), stream)
+                if other != stream:
+                    both = f"{stream.topic} and {other.topic}"
+                    raise UserError(f"{both}: both go to UDP port {stream.port} of the station; give each its own")
+    return list(found.values())
+
+
+def of_task(robot: str, address: str, name: str, task: dict[str, Any], stations: set[str]) -> Iterator[Stream]:
+    """The streams of one control task, all of whose values are texts."""
+    blocks: dict[str, Any] = task["blocks"]
+    for sender in blocks.values():
+        parameters = sender.get("parameters", {})
+        if sender["type"] != "udp-send" or parameters["address"] not in stations:
+            continue
+        packer = sender["in"]["data"].partition(".")[0]
+        if blocks.get(packer, {}).get("type") != "pack":
+            continue
+        layout = blocks[packer]["parameters"]
+        types = layout["types"]
+        names = layout.get("names") or [f"in{index}" for index in range(len(types))]
+        widths = [int(width) for width in layout.get("widths") or ["1"] * len(types)]
+        fields = tuple(_fields(names, types, widths, int(layout.get("alignment", 1))))
+        length = fields[-1].offset + struct.calcsize(f"<{fields[-1].width}{CODES[fields[-1].type]}")
+        byte_order = _BYTE_ORDERS[layout.get("byte_order", "little")]
+        yield Stream(robot, name, packer, address, int(parameters["port"]), fields, byte_order, length)
+
+
+def _fields(names: Sequence[str], types: Sequence[str], widths: Sequence[int], alignment: int) -> Iterator[Field]:
+    end = 0
+    for name, kind, width in zip(names, types, widths, strict=True):
+        offset = -(-end // alignment) * alignment
+        yield Field(name, kind, width, offset)
+        end = offset + struct.calcsize(f"<{width}{CODES[kind]}")
