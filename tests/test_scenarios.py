@@ -23,7 +23,7 @@ from tests.scenarios.plans import plans
 
 pytestmark = pytest.mark.boot
 
-SIDE_M = 0.05
+SIDE_M = 0.03
 PERIOD_US = 10_000
 ON_TIME = {"udp": 0.999, "dds": 0.995}
 """Share of the robot's steps whose command is at the valves within the period, the lost ones counted. DDS asks now and
@@ -31,7 +31,7 @@ then who is there, for five computers at once, and all are the guest's one proce
 
 # Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm,
 # heading within 0.65°, thrusters 33 s of 400 s.
-RMS_M = 0.02
+RMS_M = 0.012
 HEADING_RAD = math.radians(1)
 ON_TIME_S = 2 * 8 * 10.5 * 0.01 / 0.16
 """Of all valves: twice what starting, turning at corners and stopping take, eight changes of a velocity by 1 cm/s."""
@@ -65,7 +65,7 @@ def flights(flown: dict[str, Flight]) -> Callable[[str], Flight]:
     return lambda name: flown[name]
 
 
-@pytest.mark.parametrize("name", ["udp", "dds", "loss", "disorder", "partition", "power"])
+@pytest.mark.parametrize("name", ["udp", "dds", "loss", "disorder", "gaps"])
 def test_the_square_is_flown(flights: Callable[[str], Flight], name: str) -> None:
     """Seen to fail with a filter that does not know the thrusters' force: 276 firings in 60 s."""
     flight = flights(name)
@@ -106,8 +106,8 @@ def test_what_the_network_loses_is_lost_and_no_more(flights: Callable[[str], Fli
 
 def test_a_computer_without_power_closes_the_valves_until_it_is_back(flights: Callable[[str], Flight]) -> None:
     """Thruster mapping is gone for a second: nothing fires, and nobody has to help when it returns."""
-    flight = flights("power")
-    off_ns, on_ns = flight.events_ns
+    flight = flights("gaps")
+    off_ns, on_ns, *_ = flight.events_ns
     opened = {record["time_ns"]: sum(record["on_time"]) for record in flight.since(off_ns + TIMEOUT_NS)}
     gone = {opened[time_ns] for time_ns in opened if time_ns < on_ns}
     assert len(gone) == 1

@@ -19,10 +19,11 @@ _DISORDER = tuple(
     )
     for number in range(1, 5)
 )  # fmt: skip
-_POWER = (Event(8, "power-off", ["robot4"]), Event(9, "power-on", ["robot4"]))
-_PARTITION = (
-    Event.on(8, "robot3", "iw", "dev", "wlan0", "ibss", "leave"),
-    Event.on(8.5, "robot3", "/usr/lib/flotilla/ibss", "wlan0"),
+_GAPS = (
+    Event(6, "power-off", ["robot4"]),
+    Event(7, "power-on", ["robot4"]),
+    Event.on(10, "robot3", "iw", "dev", "wlan0", "ibss", "leave"),
+    Event.on(10.5, "robot3", "/usr/lib/flotilla/ibss", "wlan0"),
 )
 _SPIN = {"initial_velocity": [0, 0, 1]}
 """With 1 rad/s the thrusters have to turn for four seconds: they do when the link is cut."""
@@ -34,8 +35,7 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
         square("dds", "the square, by DDS", side_m, transport="dds"),
         square("loss", "the square, each radio losing a tenth", side_m, events=_LOSS),
         square("disorder", "the square, packets late, out of order and twice", side_m, events=_DISORDER),
-        square("partition", "the square, the controller alone for half a second", side_m, events=_PARTITION),
-        square("power", "the square, thruster mapping without power for a second", side_m, events=_POWER),
+        square("gaps", "the square, one computer without power for a second, then one alone", side_m, events=_GAPS),
         Plan("cut-closed", "the link cut, valves closed", 8, events=_CUT, plant={"initial_velocity": [0.01, 0, 0]}),
         Plan("cut-open", "the link cut, valves open", 8, events=_CUT, plant=_SPIN),
         Plan(
