@@ -67,7 +67,7 @@ def flights(flown: dict[str, Flight]) -> Callable[[str], Flight]:
 
 @pytest.mark.parametrize("name", ["udp", "dds", "loss", "disorder", "gaps"])
 def test_the_square_is_flown(flights: Callable[[str], Flight], name: str) -> None:
-    """Seen to fail with a filter that does not know the thrusters' force: 276 firings in 60 s."""
+    """Seen to fail, by the thrusters, with arms of 10 cm: a pulse was more than the controller's dead band."""
     flight = flights(name)
     seconds = 4 * SIDE_M / 0.01
     error, thrusters = flight.error(), flight.thrusters()

@@ -24,7 +24,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import CompressionType, Writer
 
 from images.builder import inventory, paths, progress
-from images.builder.errors import UserError
+from images.builder.errors import UserError, exit_status
 from runtime.station.telemetry import Stream, streams
 
 FLUSH_S = 1.0
@@ -157,6 +157,17 @@ def _receive(one: socket.socket) -> tuple[bytes, str] | None:
     return datagram, address
 
 
+def known_to(directory: Path) -> list[Stream]:
+    """The streams of the fleet that an inventory describes; there has to be one."""
+    known = streams(inventory.load_fleet(directory))
+    if not known:
+        raise UserError(
+            f"{paths.shown(directory)}: no control task sends to a station; "
+            "one does by a block pack and a block udp-send to the station's address"
+        )
+    return known
+
+
 def run(known: list[Stream], out: Path, address: str, seconds: float | None) -> None:
     """Record `known` to `out`, which must not be there."""
     sockets = listen((stream.port for stream in known), address)
@@ -188,19 +199,8 @@ def main() -> int:
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
     parser.add_argument("--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)")
     arguments = parser.parse_args()
-    try:
-        known = streams(inventory.load_fleet(arguments.inventory))
-        if not known:
-            raise UserError(
-                f"{paths.shown(arguments.inventory)}: no control task sends to a station; "
-                "one does by a block pack and a block udp-send to the station's address"
-            )
-        out = arguments.out or paths.BUILD / "recordings" / time.strftime("%Y-%m-%dT%H-%M-%S.mcap")
-        run(known, out, arguments.address, arguments.seconds)
-    except UserError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
+    out = arguments.out or paths.BUILD / "recordings" / time.strftime("%Y-%m-%dT%H-%M-%S.mcap")
+    return exit_status(lambda: run(known_to(arguments.inventory), out, arguments.address, arguments.seconds))
 
 
 if __name__ == "__main__":

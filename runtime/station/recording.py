@@ -47,9 +47,14 @@ class Field:
     offset: int
     """Bytes from the record's beginning."""
 
-    def of(self, record: bytes) -> Value:
-        """Its value in a record: a tuple where there are several elements."""
-        elements = struct.unpack_from(f"<{self.width}{CODES[self.type]}", record, self.offset)
+    @property
+    def end(self) -> int:
+        """Where the next one may begin."""
+        return self.offset + struct.calcsize(f"<{self.width}{CODES[self.type]}")
+
+    def of(self, record: bytes, byte_order: str = "<") -> Value:
+        """Its value in a record: a tuple where there are several elements. `byte_order`: struct(3)'s."""
+        elements = struct.unpack_from(f"{byte_order}{self.width}{CODES[self.type]}", record, self.offset)
         return elements if self.width > 1 else elements[0]
 
     @property
@@ -75,7 +80,7 @@ class Recording:
 def _check_field(field: Field, bytes_of_record: int) -> None:
     if field.type not in CODES or field.width < 1 or field.offset < 0:
         raise ValueError(f"field {field.name} is of no known kind")
-    if field.offset + struct.calcsize(f"<{field.width}{CODES[field.type]}") > bytes_of_record - CHECK.size:
+    if field.end > bytes_of_record - CHECK.size:
         raise ValueError(f"field {field.name} reaches beyond its record")
 
 

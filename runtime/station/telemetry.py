@@ -6,7 +6,6 @@ widths are the datagram.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,19 +15,9 @@ import yaml
 from images.builder import identity
 from images.builder.errors import UserError
 from images.builder.fleet import Fleet
-from runtime.station.recording import CODES, Value
+from runtime.station.recording import Field, Value
 
 _BYTE_ORDERS = {"little": "<", "big": ">"}
-
-
-@dataclass(frozen=True)
-class Field:
-    name: str
-    type: str
-    """As tasks name it: `boolean`, `int8` to `uint64`, `single`, `double`."""
-    width: int
-    offset: int
-    """Bytes from the datagram's beginning."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +35,11 @@ class Stream:
     fields: tuple[Field, ...]
     byte_order: str
     """Of struct(3): `<` or `>`."""
-    length: int
-    """Bytes of a datagram."""
+
+    @property
+    def length(self) -> int:
+        """Bytes of a datagram."""
+        return self.fields[-1].end
 
     @property
     def topic(self) -> str:
@@ -56,11 +48,7 @@ class Stream:
 
     def unpack(self, datagram: bytes) -> dict[str, Value]:
         """Its values by name; the length has to be right."""
-        values: dict[str, Value] = {}
-        for field in self.fields:
-            found = struct.unpack_from(f"{self.byte_order}{field.width}{CODES[field.type]}", datagram, field.offset)
-            values[field.name] = found if field.width > 1 else found[0]
-        return values
+        return {field.name: field.of(datagram, self.byte_order) for field in self.fields}
 
 
 def streams(fleet: Fleet) -> list[Stream]:
@@ -94,14 +82,13 @@ def of_task(robot: str, address: str, name: str, task: dict[str, Any], stations:
         names = layout.get("names") or [f"in{index}" for index in range(len(types))]
         widths = [int(width) for width in layout.get("widths") or ["1"] * len(types)]
         fields = tuple(_fields(names, types, widths, int(layout.get("alignment", 1))))
-        length = fields[-1].offset + struct.calcsize(f"<{fields[-1].width}{CODES[fields[-1].type]}")
         byte_order = _BYTE_ORDERS[layout.get("byte_order", "little")]
-        yield Stream(robot, name, packer, address, int(parameters["port"]), fields, byte_order, length)
+        yield Stream(robot, name, packer, address, int(parameters["port"]), fields, byte_order)
 
 
 def _fields(names: Sequence[str], types: Sequence[str], widths: Sequence[int], alignment: int) -> Iterator[Field]:
     end = 0
     for name, kind, width in zip(names, types, widths, strict=True):
-        offset = -(-end // alignment) * alignment
-        yield Field(name, kind, width, offset)
-        end = offset + struct.calcsize(f"<{width}{CODES[kind]}")
+        field = Field(name, kind, width, offset=-(-end // alignment) * alignment)
+        yield field
+        end = field.end

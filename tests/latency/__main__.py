@@ -7,7 +7,7 @@ import sys
 from typing import get_args
 
 from images.builder import inventory, paths
-from images.builder.errors import UserError
+from images.builder.errors import UserError, exit_status
 from images.builder.fleet import Board
 from tests.latency import boottime, gate, report, results, run, target
 
@@ -94,15 +94,7 @@ def main() -> int:
             help="standard, a minute each; quick, what every test run measures; disk, bounded only (%(default)s)",
         )  # fmt: skip
     arguments = parser.parse_args()
-    try:
-        _COMMANDS[arguments.command][0](arguments)
-    except UserError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
-        return 130
-    return 0
+    return exit_status(lambda: _COMMANDS[arguments.command][0](arguments))
 
 
 if __name__ == "__main__":

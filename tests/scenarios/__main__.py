@@ -7,7 +7,7 @@ import shutil
 import sys
 
 from images.builder import inventory, paths, progress
-from images.builder.errors import UserError
+from images.builder.errors import UserError, exit_status
 from tests.scenarios import report, virtual
 from tests.scenarios.flight import Flight
 from tests.scenarios.plans import SIDE_M, plans
@@ -16,6 +16,8 @@ OUT = paths.BUILD / "scenarios"
 
 
 def _fly(names: list[str], side_m: float) -> None:
+    if not 0.01 <= side_m <= 10:
+        raise UserError(f"--side {side_m:g}: is not from 0.01 to 10 m")
     there = {plan.name: plan for plan in plans(side_m)}
     for name in names:
         if name not in there:
@@ -37,17 +39,7 @@ def main() -> int:
     parser.add_argument("flights", nargs="*", help="names; without, all")
     parser.add_argument("--side", type=float, default=SIDE_M, metavar="M", help="of the square (%(default)s m)")
     arguments = parser.parse_args()
-    try:
-        if not 0.01 <= arguments.side <= 10:
-            raise UserError(f"--side {arguments.side:g}: is not from 0.01 to 10 m")
-        _fly(arguments.flights, arguments.side)
-    except UserError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
-        return 130
-    return 0
+    return exit_status(lambda: _fly(arguments.flights, arguments.side))
 
 
 if __name__ == "__main__":

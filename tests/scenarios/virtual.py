@@ -21,6 +21,7 @@ import yaml
 from images.builder import identity, inventory, paths, runtime
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
+from runtime.station import telemetry
 from tests.latency import machine, results, subject
 
 HERE = Path(__file__).parent
@@ -95,18 +96,41 @@ def _changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
     own = {key.split(".", 1)[1]: value for key, value in changes.items() if key.split(".")[0] == name}
     if not own:
         return content
-    task = yaml.load(content, yaml.BaseLoader)  # all is text to the runtime, `on` and `off` too
+    task = _parsed(content)
     for key, value in own.items():
         block, parameter = key.split(".")
         task["blocks"][block]["parameters"][parameter] = value
     return str(yaml.safe_dump(task)).encode()
 
 
-def _plant(plan: Plan, robot_address: str, gyro: str) -> bytes:
-    parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
-    template = jinja2.Template((HERE / "plant.yml.j2").read_text(), undefined=jinja2.StrictUndefined)
-    text: str = template.render(parameters=parameters, robot_address=robot_address, gyro=gyro)
-    return text.encode()
+def _own(template: str, **values: object) -> bytes:
+    """A task of the scenario's own, from its template."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(HERE), undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template(template).render(values).encode()
+
+
+def _streams(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> dict[str, telemetry.Stream]:
+    """What the station hears, by the task that sends it."""
+    stations = {str(station.address) for station in described.stations}
+    return {
+        stream.task: stream
+        for robot in described.robots.values()
+        for name in robot.control_tasks
+        for stream in telemetry.of_task(
+            robot.name, str(robot.address), name, _parsed(brought[robot.name][_path(name)]), stations
+        )
+    }
+
+
+def _path(task: str) -> str:
+    return str(identity.TASKS / f"{task}.yml")
+
+
+def _parsed(task: bytes) -> Any:
+    """All is text to the runtime, `on` and `off` too."""
+    return yaml.load(task, yaml.BaseLoader)
 
 
 def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -114,21 +138,27 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
     directory = DIRECTORY / plan.name
     described = fleet(plan.transport)
     flying = described.robot_with("valves")
+    brought = _rendered(described, keys)
+    robot_parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
     there = {
-        f"{directory}/plant.yml": _plant(plan, str(flying.address), gyro_device(described, board)),
-        f"{directory}/station.yml": (HERE / "station.yml").read_bytes(),
+        f"{directory}/plant.yml": _own(
+            "plant.yml.j2",
+            parameters=robot_parameters,
+            robot_address=flying.address,
+            gyro=gyro_device(described, board),
+        ),
+        f"{directory}/station.yml": _own("station.yml.j2", **_streams(described, brought)),
     }
     tasks = [
         {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
         {"name": "plant", "computer": STATION, "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
     ]
-    brought = _rendered(described, keys)
     for robot in described.robots.values():
         configuration = f"{directory}/{robot.name}-cyclonedds.xml"
         there[configuration] = brought[robot.name]["/etc/flotilla/cyclonedds.xml"]
         for name in robot.control_tasks:
             file = f"{directory}/{name}.yml"
-            there[file] = _changed(name, brought[robot.name][str(identity.TASKS / f"{name}.yml")], plan.changes)
+            there[file] = _changed(name, brought[robot.name][_path(name)], plan.changes)
             tasks.append({"name": name, "computer": robot.name, "file": file, "cyclonedds": configuration})
     events = [asdict(event) for event in plan.events]
     return {"name": plan.name, "seconds": plan.seconds, "tasks": tasks, "events": events}, there
