@@ -105,8 +105,8 @@ runtime: | setup-tests ## the runtime's programs for this computer, in build/run
 	$(Q)test -f $(BUILD)/runtime/build.ninja || $(meson) setup $(BUILD)/runtime runtime >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime)
 
-check-runtime: | setup-tests ## the runtime's format, clang-tidy, and unit tests with AddressSanitizer and UBSan
-	$(Q)git ls-files 'runtime/*.[ch]' | xargs $(VENV)/bin/clang-format --dry-run -Werror
+check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
+	$(Q)git ls-files '*.[ch]' | xargs $(VENV)/bin/clang-format --dry-run -Werror
 	$(Q)test -f $(BUILD)/runtime-sanitized/build.ninja || $(meson) setup $(BUILD)/runtime-sanitized runtime -Dtests=true \
 	    -Db_sanitize=address,undefined -Dbuildtype=debugoptimized >/dev/null
 	$(Q)$(call compile,$(BUILD)/runtime-sanitized)

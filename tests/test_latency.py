@@ -10,7 +10,7 @@ import pytest
 
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
-from tests.lab.busy_host import busy_host
+from tests.lab.perturb import perturbed_host
 from tests.latency import boottime, gate, machine, run, subject
 from tests.latency.controls import DELAY_US, Control
 from tests.latency.results import Latency, Results
@@ -47,10 +47,11 @@ def test_latency_is_the_accepted_one(measured: Callable[[str], Results], boards:
     assert accepted.startswith("every figure is that of")
 
 
-def test_a_run_repeats_to_the_byte_on_a_busy_host(
+def test_a_run_repeats_to_the_byte_however_the_host_schedules(
     measured: Callable[[str], Results], boards: dict[str, Board], artefacts: Path
 ) -> None:
-    with busy_host():
+    """Seen to fail without QEMU's recording: one of four runs had a sample elsewhere."""
+    with perturbed_host():
         again = run.measure(boards["lean"], "quick", artefacts)
     assert gate.compare(again, measured("lean")) == []
     assert again.text() == measured("lean").text()

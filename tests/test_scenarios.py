@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from images.builder.fleet import Board, Fleet
-from tests.lab.busy_host import busy_host
+from tests.lab.perturb import perturbed_host
 from tests.scenarios import report, virtual
 from tests.scenarios.flight import HOPS, Flight
 from tests.scenarios.plans import plans
@@ -166,7 +166,7 @@ def test_the_report_shows_every_flight(flown: dict[str, Flight], session_artefac
 
 
 def test_flights_repeat_to_the_byte(board: Board, artefacts: Path) -> None:
-    """Once on a loaded host. Seen to fail with another seed of the plant's noise."""
+    """Once on a host that schedules at random. Seen to fail with another seed of the plant's noise."""
 
     def left(name: str) -> dict[str, bytes]:
         flights = virtual.fly(REPEATED, board, artefacts / name)
@@ -178,7 +178,7 @@ def test_flights_repeat_to_the_byte(board: Board, artefacts: Path) -> None:
         }
 
     first = left("first")
-    with busy_host():
+    with perturbed_host():
         second = left("second")
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []

@@ -179,8 +179,7 @@ static void print(void)
 {
     const char *comma = "";
 
-    printf("{\"thread\": {\"0\": {\"cycles\": %lu, \"max\": %lld, \"histogram\": {", count,
-           (long long)latest_us);
+    printf("{\"thread\": {\"0\": {\"cycles\": %lu, \"max\": %lld, \"histogram\": {", count, (long long)latest_us);
     for (unsigned bucket = 0; bucket < BUCKETS; bucket++)
         if (histogram[bucket]) {
             printf("%s\"%u\": %u", comma, bucket, histogram[bucket]);

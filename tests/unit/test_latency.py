@@ -376,7 +376,8 @@ def test_machine_is_the_board_in_virtual_time(tmp_path: Path) -> None:
     qemu = machine.Emulator(read_lock("emulator"), tmp_path / "tree")
     guest = machine.Machine(qemu, board, tmp_path / "vmlinuz", tmp_path / "initrd.img", ("quiet",))
     argv = guest.command_line(tmp_path / "console", tmp_path / "results")
-    assert {"-nodefaults", "shift=3,sleep=off", f"{board.qemu.machine},usb=off,hpet=off"} <= set(argv)
+    assert {"-nodefaults", f"{board.qemu.machine},usb=off,hpet=off"} <= set(argv)
+    assert "shift=3,sleep=off,rr=record,rrfile=/dev/null" in argv
     assert f"file,id=port11,path={tmp_path}/results" in argv
     assert machine.results_tty(board) == "ttyS11"
     assert [argv[at + 1] for at, word in enumerate(argv) if word == "-device"][1:] == board.qemu.devices
