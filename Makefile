@@ -137,7 +137,7 @@ param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=headin
 	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))
 
 ##@ Real time
-.PHONY: latency latency-accept boot-time hwcheck scenarios
+.PHONY: latency latency-accept boot-time hwcheck scenarios scenarios-accept
 LATENCY = $(PYTHON) -m tests.latency
 # What is measured: the board's shipped system, or another kernel of it, or less of it, or a robot.
 measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--plan $(PLAN))
@@ -156,6 +156,9 @@ boot-time: | setup-tests ## where a boot spends its time, in virtual time
 
 scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=1] [FLIGHTS="udp dds"]
 	$(Q)$(PYTHON) -m tests.scenarios $(if $(SIDE),--side $(SIDE)) $(FLIGHTS)
+
+scenarios-accept: | setup-tests ## make a new run the accepted one: commit tests/scenarios/baseline.json
+	$(Q)$(PYTHON) -m tests.scenarios --accept
 
 ##@ Housekeeping
 .PHONY: setup setup-tests clean help

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import threading
 import time
@@ -18,7 +19,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from images.builder import paths
+from images.builder import boot, param, paths
+from images.builder.errors import UserError
 from tests.conftest import GuestFactory, RobotGuest
 from tests.emulators.dsp3000 import Dsp3000
 from tests.emulators.ir104 import Ir104
@@ -209,6 +211,30 @@ def test_the_control_thread_is_real_time(loop: Loop) -> None:
     classes = {line.split()[0]: line.split()[1:] for line in threads.splitlines()}
     assert classes["heading"] == ["FF", "80"]
     assert classes["gyro"] == ["FF", "79"]
+
+
+def test_parameters_are_set_from_the_station(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = loop.robot.robot
+    monkeypatch.setattr(boot, "forwarded_port", lambda _: loop.robot.machine.ssh_port())
+    file = yaml.safe_load(TASK.read_text())["blocks"]["attitude"]["parameters"]
+    assert param.param(robot, "heading", "attitude.kp") == str(file["kp"])
+    said = param.param(robot, "heading", "attitude.kp", "0.35")
+    assert re.fullmatch(rf"attitude\.kp: {file['kp']} → 0\.35 from step \d+ on", said)
+    assert param.param(robot, "heading", "attitude.kp") == "0.35"
+    journal = ["sudo", "journalctl", "-o", "cat", "-u", UNIT, "--no-pager"]
+    assert f"flotilla: heading: user 1000: {said}" in loop.robot.shell.run(journal).stdout.splitlines()
+    with pytest.raises(UserError, match="robot1: task heading: block attitude: parameter filter: -1 is outside 0 to "):
+        param.param(robot, "heading", "attitude.filter", "-1")
+    with pytest.raises(UserError, match="robot1: no task bearing runs here"):
+        param.param(robot, "bearing")
+    param.param(robot, "heading", "attitude.kp", str(file["kp"]))
+
+
+def test_parameters_are_the_users_of_the_task_alone(loop: Loop) -> None:
+    argv = ["sudo", "-u", "nobody", "flotilla-param", "heading", "attitude.kp", "1"]
+    refused = loop.robot.shell.run(argv, check=False)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "only the user who runs task heading may" in refused.stderr
 
 
 def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:

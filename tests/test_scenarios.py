@@ -17,13 +17,12 @@ import pytest
 
 from images.builder.fleet import Board, Fleet
 from tests.lab.perturb import perturbed_host
-from tests.scenarios import report, virtual
+from tests.scenarios import gate, report, virtual
 from tests.scenarios.flight import HOPS, Flight
-from tests.scenarios.plans import plans
+from tests.scenarios.plans import TESTED_SIDE_M, plans
 
 pytestmark = pytest.mark.boot
 
-SIDE_M = 0.03
 PERIOD_US = 10_000
 ON_TIME = {"udp": 0.999, "dds": 0.995}
 """Share of the robot's steps whose command is at the valves within the period, the lost ones counted. DDS asks now and
@@ -56,7 +55,7 @@ def board(fleet: Fleet) -> Board:
 
 @pytest.fixture(scope="module")
 def flown(board: Board, session_artefacts: Path) -> dict[str, Flight]:
-    directories = virtual.fly(plans(SIDE_M), board, session_artefacts / "scenarios")
+    directories = virtual.fly(plans(TESTED_SIDE_M), board, session_artefacts / "scenarios")
     return {name: Flight(directory) for name, directory in directories.items()}
 
 
@@ -65,11 +64,11 @@ def flights(flown: dict[str, Flight]) -> Callable[[str], Flight]:
     return lambda name: flown[name]
 
 
-@pytest.mark.parametrize("name", ["udp", "dds", "loss", "disorder", "gaps"])
+@pytest.mark.parametrize("name", ["udp", "dds", "loss", "disorder", "gaps", "strangers"])
 def test_the_square_is_flown(flights: Callable[[str], Flight], name: str) -> None:
     """Seen to fail, by the thrusters, with arms of 10 cm: a pulse was more than the controller's dead band."""
     flight = flights(name)
-    seconds = 4 * SIDE_M / 0.01
+    seconds = 4 * TESTED_SIDE_M / 0.01
     error, thrusters = flight.error(), flight.thrusters()
     print(f"{name}: RMS {error.rms_m * 1000:.1f} mm, at most {error.max_m * 1000:.1f} mm")
     print(f"{name}: heading within {math.degrees(error.max_heading_rad):.2f}°")
@@ -96,6 +95,11 @@ def test_four_hops_take_less_than_a_period(flights: Callable[[str], Flight], nam
     assert name == "dds" or flight.lost() == 0
 
 
+def test_hops_are_the_accepted_ones(flown: dict[str, Flight]) -> None:
+    """Seen to fail whenever the root or a task changes: then `make scenarios-accept`."""
+    gate.check(gate.latencies(flown))
+
+
 def test_what_the_network_loses_is_lost_and_no_more(flights: Callable[[str], Flight]) -> None:
     """Four hops, each with nine of ten: about two thirds arrive."""
     flight = flights("loss")
@@ -113,6 +117,30 @@ def test_a_computer_without_power_closes_the_valves_until_it_is_back(flights: Ca
     assert len(gone) == 1
     back_ns = next(time_ns for time_ns in opened if opened[time_ns] not in gone)
     print(f"control resumes {(back_ns - on_ns) / 1e9:.2f} s after the tasks start")
+
+
+def test_strangers_are_refused_and_counted(flights: Callable[[str], Flight]) -> None:
+    """Noise of a command's length among them. Seen to fail with receivers that take from anybody."""
+    flight = flights("strangers")
+    last = flight.steps[-1]
+    steps = flight.statistics["valves"]["steps"]
+    print(f"refused {last['refused']} until the station was gone, in {steps} steps; lost {flight.lost()}")
+    assert last["refused"] > 0.9 * len(flight.steps)
+    assert {record["refused"] for record in flights("udp").steps} == {0}
+
+
+def test_robots_do_not_care_for_station_or_clock(flights: Callable[[str], Flight]) -> None:
+    """The clock is set by an hour in the midst of the flight, the station gone at its end."""
+    flight = flights("strangers")
+    for name in ("sensors", "navigation", "control", "thruster-mapping", "valves"):
+        found = flight.statistics[name]
+        print(name, {key: found[key] for key in ("steps", "overruns", "timeouts") if key in found})
+        assert found["overruns"] == 0
+    gone = flight.since(flight.events_ns[-1])
+    assert len(gone) > 50, "the flight ends too early"
+    distance = max(math.hypot(*record["pose"][:2]) for record in gone)
+    print(f"within {distance * 1000:.1f} mm without a station")
+    assert distance <= 2 * RMS_M
 
 
 def velocities(flight: Flight) -> list[tuple[float, float, float]]:
@@ -154,7 +182,7 @@ def test_without_the_time_out_it_spins(flights: Callable[[str], Flight]) -> None
 
 def test_the_report_shows_every_flight(flown: dict[str, Flight], session_artefacts: Path) -> None:
     """Its pages are among the artefacts, to be looked at."""
-    titles = {plan.name: plan.title for plan in plans(SIDE_M)}
+    titles = {plan.name: plan.title for plan in plans(TESTED_SIDE_M)}
     page = report.write({titles[name]: flight for name, flight in flown.items()}, session_artefacts)
     text = page.read_text()
     assert all(f"<h2>{title}</h2>" in text for title in titles.values())

@@ -122,14 +122,15 @@ def _moved(before: Outcome, after: Outcome) -> list[str]:
         if old is None or new is None:
             texts.append(f"{quantity}: {'new' if old is None else 'not measured any more'}")
         elif old != new:
-            texts.append(f"{quantity}: {_distribution(old, new)}")
+            texts.append(f"{quantity}: {differences(old, new)}")
     if not texts and before != after:
         names = [name for name in Outcome.model_fields if getattr(before, name) != getattr(after, name)]
         texts.append(f"{', '.join(names)} moved, no latency did")
     return texts
 
 
-def _distribution(old: Latency, new: Latency) -> str:
+def differences(old: Latency, new: Latency) -> str:
+    """In words, of two distributions."""
     before, after = (
         {"samples": each.samples, "min": each.min_us, "mean": each.mean_us}
         | {f"{percent} %": us for percent, us in each.percentiles_us.items()}

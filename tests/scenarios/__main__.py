@@ -8,11 +8,16 @@ import sys
 
 from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
-from tests.scenarios import report, virtual
+from images.builder.fleet import Board
+from tests.scenarios import gate, report, virtual
 from tests.scenarios.flight import Flight
-from tests.scenarios.plans import SIDE_M, plans
+from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans
 
 OUT = paths.BUILD / "scenarios"
+
+
+def _board() -> Board:
+    return inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
 
 
 def _fly(names: list[str], side_m: float) -> None:
@@ -23,23 +28,31 @@ def _fly(names: list[str], side_m: float) -> None:
         if name not in there:
             raise UserError(f"{name}: there is no such flight; there are {', '.join(there)}")
     chosen = [there[name] for name in names or there]
-    board = inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
     shutil.rmtree(OUT, ignore_errors=True)
     seconds = sum(plan.seconds for plan in chosen)
     with progress.step(f"{len(chosen)} flights, {seconds:g} virtual seconds"):
-        directories = virtual.fly(chosen, board, OUT)
+        directories = virtual.fly(chosen, _board(), OUT)
     page = report.write(
         {there[name].title: Flight(directory) for name, directory in directories.items()}, paths.BUILD / "reports"
     )
     print(f"{paths.shown(page)}; what each task said and recorded: {paths.shown(OUT)}/flights")
 
 
+def _accept() -> None:
+    tested = plans(TESTED_SIDE_M)
+    with progress.step(f"{len(tested)} flights, {sum(plan.seconds for plan in tested):g} virtual seconds"):
+        directories = virtual.fly(tested, _board(), OUT)
+    gate.accept(gate.latencies({name: Flight(directory) for name, directory in directories.items()}))
+    print(f"{paths.shown(gate.BASELINE)} has the hops of these flights; commit it")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.scenarios", description="Flights in virtual time.")
     parser.add_argument("flights", nargs="*", help="names; without, all")
     parser.add_argument("--side", type=float, default=SIDE_M, metavar="M", help="of the square (%(default)s m)")
+    parser.add_argument("--accept", action="store_true", help="fly as the tests do, and accept the hops' latencies")
     arguments = parser.parse_args()
-    return exit_status(lambda: _fly(arguments.flights, arguments.side))
+    return exit_status(_accept if arguments.accept else lambda: _fly(arguments.flights, arguments.side))
 
 
 if __name__ == "__main__":

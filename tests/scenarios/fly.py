@@ -64,10 +64,13 @@ class Flight:
     def __init__(self, tasks: list[dict[str, str]], out: Path) -> None:
         self.tasks, self.out = tasks, out
         self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.spawned: list[subprocess.Popen[bytes]] = []
         self.actions: dict[str, Callable[..., None]] = {
             "run": run,
             "power-off": self.power_off,
             "power-on": self.power_on,
+            "spawn": self.spawn,
+            "lose": self.lose,
         }
         for task in tasks:
             self.start(task)
@@ -90,11 +93,21 @@ class Flight:
             if task["computer"] == computer:
                 self.start(task, "-again")
 
+    def spawn(self, *argv: str) -> None:
+        """A command that goes on beside the tasks, and has to have succeeded when they end."""
+        self.spawned.append(subprocess.Popen(argv))
+
+    def lose(self, task: str) -> None:
+        """A task is gone, and nobody listens where it did."""
+        self.running[task].kill()
+        self.running.pop(task).wait(_END_S)
+
     def end(self) -> dict[str, int]:
-        """The status of each task, which was asked to end."""
+        """The status of each task, which was asked to end, and of what was spawned."""
+        statuses = {str(spawned.args): spawned.wait(_END_S) for spawned in self.spawned}
         for task in self.running.values():
             task.send_signal(signal.SIGTERM)
-        return {name: task.wait(_END_S) for name, task in self.running.items()}
+        return statuses | {name: task.wait(_END_S) for name, task in self.running.items()}
 
 
 def fly(flight: dict[str, Any], out: Path) -> None:
@@ -110,7 +123,7 @@ def fly(flight: dict[str, Any], out: Path) -> None:
     time.sleep(max(0.0, begin + flight["seconds"] - time.monotonic()))
     statuses = tasks.end()
     if any(statuses.values()):
-        raise RuntimeError(f"{flight['name']}: tasks ended with {statuses}")
+        raise RuntimeError(f"{flight['name']}: ended with {statuses}")
 
 
 def join(computer: str) -> None:

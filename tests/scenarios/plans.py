@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from tests.scenarios.virtual import Event, Plan, square
 
 SIDE_M = 1.0
 """Of the published square, flown at 1 cm/s."""
+TESTED_SIDE_M = 0.03
+"""Of the square that every test run flies."""
 CUT_S = 2.5
 _CUT = (Event.on(CUT_S, "robot1", "iw", "dev", "wlan0", "ibss", "leave"),)
 _LOSS = tuple(
@@ -25,6 +29,8 @@ _GAPS = (
     Event.on(10, "robot3", "iw", "dev", "wlan0", "ibss", "leave"),
     Event.on(10.5, "robot3", "/usr/lib/flotilla/ibss", "wlan0"),
 )
+STATION_GONE_S = 4
+"""Before the flight's end."""
 _SPIN = {"initial_velocity": [0, 0, 1]}
 """With 1 rad/s the thrusters have to turn for four seconds: they do when the link is cut."""
 
@@ -36,6 +42,7 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
         square("loss", "the square, each radio losing a tenth", side_m, events=_LOSS),
         square("disorder", "the square, packets late, out of order and twice", side_m, events=_DISORDER),
         square("gaps", "the square, one computer without power for a second, then one alone", side_m, events=_GAPS),
+        _strangers(side_m),
         Plan("cut-closed", "the link cut, valves closed", 8, events=_CUT, plant={"initial_velocity": [0.01, 0, 0]}),
         Plan("cut-open", "the link cut, valves open", 8, events=_CUT, plant=_SPIN),
         Plan(
@@ -43,3 +50,11 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
             changes={"valves.relays.timeout": 60},
         ),
     )  # fmt: skip
+
+
+def _strangers(side_m: float) -> Plan:
+    title = "the square, a stranger in the cell, the clock set, at last no station"
+    plan = square("strangers", title, side_m, stranger=True)
+    seconds = plan.seconds + STATION_GONE_S
+    events = (Event(5, "run", ["date", "--set", "+1 hour"]), Event(plan.seconds, "lose", ["station"]))
+    return replace(plan, seconds=seconds, events=events)

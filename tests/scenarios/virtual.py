@@ -29,8 +29,12 @@ INVENTORY = HERE / "inventory"
 PLANT = paths.PROJECT / "tests" / "plant"
 DIRECTORY = subject.DIRECTORY
 STATION = "station"
+STRANGER = "stranger"
+"""A computer in the cell that is not of the fleet."""
 RELAYS = ("-chardev", "null,id=relays", "-device", "isa-parallel,iobase=0x300,chardev=relays")
 """What can be written and read back at the relay board's first register: a printer port's data register."""
+IGPS_BYTES = 16
+"""Of a position's datagram."""
 MEMORY_MIB = 768
 """Of the guest, which is five computers."""
 _BOOT_LIMIT_S = 600
@@ -40,11 +44,11 @@ _LIMIT_PER_SECOND = 10
 
 @dataclass(frozen=True)
 class Event:
-    """What happens in the midst of a flight: a command, or a computer without power until it has it again."""
+    """What happens in the midst of a flight; fly.py says what the actions do."""
 
     at_s: float
     """After the start of the tasks."""
-    action: Literal["run", "power-off", "power-on"]
+    action: Literal["run", "spawn", "lose", "power-off", "power-on"]
     arguments: Sequence[str]
 
     @classmethod
@@ -65,6 +69,8 @@ class Plan:
     events: Sequence[Event] = ()
     plant: Mapping[str, object] = field(default_factory=dict)
     """Parameters that are not those of floating_robot.yml."""
+    stranger: bool = False
+    """A computer that is not of the fleet sends to all ports of the control tasks, as often as they step."""
     changes: Mapping[str, object] = field(default_factory=dict)
     """Parameters of control tasks that are not those of their files, by `task.block.parameter`."""
 
@@ -124,6 +130,17 @@ def _streams(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> di
     }
 
 
+def _receivers(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> list[str]:
+    """Where control tasks receive datagrams, and of what length: `address:port:length`."""
+    return [
+        f"{robot.address}:{block['parameters']['port']}:{block['parameters'].get('length', IGPS_BYTES)}"
+        for robot in described.robots.values()
+        for name in robot.control_tasks
+        for block in _parsed(brought[robot.name][_path(name)])["blocks"].values()
+        if block["type"] in ("udp-receive", "igps")
+    ]
+
+
 def _path(task: str) -> str:
     return str(identity.TASKS / f"{task}.yml")
 
@@ -161,6 +178,9 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
             there[file] = _changed(name, brought[robot.name][_path(name)], plan.changes)
             tasks.append({"name": name, "computer": robot.name, "file": file, "cyclonedds": configuration})
     events = [asdict(event) for event in plan.events]
+    if plan.stranger:
+        shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]
+        events.append(asdict(Event(0, "spawn", ["ip", "netns", "exec", STRANGER, *shout])))
     return {"name": plan.name, "seconds": plan.seconds, "tasks": tasks, "events": events}, there
 
 
@@ -176,7 +196,7 @@ def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
     cell = f"{DIRECTORY}/ibss.conf"
     there = {
         f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
-        f"{DIRECTORY}/fly.py": (HERE / "fly.py").read_bytes(),
+        **{f"{DIRECTORY}/{name}": (HERE / name).read_bytes() for name in ("fly.py", "stranger.py")},
         cell: _rendered(described, keys)[flying.name]["/etc/flotilla/ibss.conf"],
     }
     flights = []
@@ -186,8 +206,10 @@ def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
         there |= brought
     length = described.network.subnet.prefixlen
     hosts = [*described.robots.values(), *described.stations]
+    addresses = {host.name: str(host.address) for host in hosts}
+    addresses[STRANGER] = str(described.network.subnet.broadcast_address - 2)
     session = {
-        "computers": [{"name": host.name, "address": f"{host.address}/{length}"} for host in hosts],
+        "computers": [{"name": name, "address": f"{address}/{length}"} for name, address in addresses.items()],
         "links": {"/dev/robot/gyro": gyro_device(described, board), "/etc/flotilla/ibss.conf": cell},
         "safe": [f"{DIRECTORY}/{plans[0].name}/valves.yml"],
         "flights": flights,
