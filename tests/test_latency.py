@@ -11,16 +11,14 @@ import pytest
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
 from tests.lab.perturb import perturbed_host
-from tests.latency import boottime, gate, machine, run, subject
+from tests.latency import gate, machine, run, subject
 from tests.latency.controls import DELAY_US, Control
 from tests.latency.results import Latency, Results
 
-pytestmark = pytest.mark.boot
+pytestmark = [pytest.mark.boot, pytest.mark.virtual_time]
 
 BOARD = "smartcoret3"
 KERNELS = ("lean", "debian")
-FIRST_STEP_S = 8.0
-"""A control task has its first period within this virtual time from the boot loader's end."""
 
 
 @pytest.fixture(scope="module")
@@ -112,14 +110,6 @@ def test_gate_notices_one_sample_elsewhere(measured: Callable[[str], Results], t
     changed = accepted.model_copy(update={"scenarios": accepted.scenarios | {"idle": moved}})
     with pytest.raises(UserError, match=rf"idle: wake-up: .*100 % {latest} → {latest + 1} µs"):
         gate.check(changed, file)
-
-
-def test_a_control_task_begins_soon_after_power_on(boards: dict[str, Board], artefacts: Path) -> None:
-    """Booted from the card. Seen to fail when the task's unit waits for basic.target, as units do by default."""
-    boots = boottime.measure(boards["lean"], artefacts)
-    print(boottime.account(boots))
-    assert boots.card["boot"]["failed_units"] == []
-    assert boots.first_step_s <= FIRST_STEP_S
 
 
 def test_a_guest_that_does_not_end_is_ended(boards: dict[str, Board], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Generator, Iterator
@@ -44,8 +45,11 @@ def artefacts(request: pytest.FixtureRequest) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def session_artefacts(request: pytest.FixtureRequest) -> Iterator[Path]:
-    """A directory of what many tests share, `build/test-artefacts/session/`: kept when any test failed."""
-    directory = DIRECTORY / "session"
+    """A directory of what many tests share, `build/test-artefacts/session/`: kept when any test failed.
+
+    Each of several processes that run tests (pytest-xdist) has one of its own.
+    """
+    directory = DIRECTORY / "-".join(["session", *filter(None, [os.environ.get("PYTEST_XDIST_WORKER")])])
     shutil.rmtree(directory, ignore_errors=True)
     directory.mkdir(parents=True)
     yield directory
