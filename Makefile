@@ -97,7 +97,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param record live
+.PHONY: runtime check-runtime fuzz bench-runtime param record live top
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -137,6 +137,9 @@ record: | setup ## what robots tell this station, as an MCAP file for Foxglove o
 
 live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
 	$(Q)$(station) --live $(PORT) $(if $(OUT),--record $(OUT))
+
+top: | setup ## how it comes, a line for each stream: rate, loss, age, flags [SECONDS=]; OUT=file and PORT=8765 as above
+	$(Q)$(station) --top $(if $(OUT),--record $(OUT)) $(if $(PORT),--live $(PORT))
 
 param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
 	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))

@@ -85,7 +85,8 @@ def test_what_a_task_packs_is_what_is_read(flotilla_run: Path, tmp_path: Path) -
         one.settimeout(PATIENCE)
         out = tmp_path / "a.mcap"
         recorder = Recorder([stream], out)
-        receiver = Receiver([stream], [recorder])
+        receiver = Receiver([stream])
+        receiver.sinks.append(recorder)
         with running([flotilla_run], tmp_path / "sender.yml", text):
             for _ in range(50):
                 receiver.take(one.recv(100), "127.0.0.1", stream.port, time.time_ns())

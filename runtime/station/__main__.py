@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -10,9 +11,12 @@ from pathlib import Path
 from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
 from runtime.station.live import PORT, Server
-from runtime.station.receiver import Receiver, Sink, listen, receive
+from runtime.station.receiver import Receiver, listen, receive
 from runtime.station.record import Recorder
 from runtime.station.telemetry import Stream, streams
+from runtime.station.top import Top
+
+TOP_S = 2.0
 
 
 def known_to(directory: Path) -> list[Stream]:
@@ -29,19 +33,28 @@ def known_to(directory: Path) -> list[Stream]:
 def run(arguments: argparse.Namespace) -> None:
     known = known_to(arguments.inventory)
     sockets = listen((stream.port for stream in known), arguments.address)
-    sinks: list[Sink] = []
+    receiver = Receiver(known)
     doing = []
-    if arguments.live is not None:
-        sinks.append(Server(known, arguments.live_address, arguments.live))
-        doing.append("serving")
-    if arguments.record:
-        sinks.append(Recorder(known, arguments.record))
-        doing.append("recording")
-    receiver = Receiver(known, sinks)
-    with progress.step(" and ".join(doing)) as step:
-        receive(receiver, sockets, arguments.seconds, step.note)
-    ends = [sink.end() for sink in sinks]
-    print("\n".join([*receiver.summary, *ends]))
+    seconds = arguments.seconds
+    with contextlib.ExitStack() as during:
+        if arguments.live is not None:
+            receiver.sinks.append(Server(known, arguments.live_address, arguments.live))
+            doing.append("serving")
+        if arguments.record:
+            receiver.sinks.append(Recorder(known, arguments.record))
+            doing.append("recording")
+        if arguments.top:
+            top = Top(known, receiver.counts)
+            receiver.sinks.append(top)
+            if not doing and not top.console.is_terminal:
+                seconds = seconds or TOP_S
+            during.enter_context(top.screen())
+            note = None
+        else:
+            note = during.enter_context(progress.step(" and ".join(doing))).note
+        receive(receiver, sockets, seconds, note)
+    ends = [sink.end() for sink in receiver.sinks]
+    print("\n".join([*(receiver.summary if doing else []), *ends]))
 
 
 def main() -> int:
@@ -59,12 +72,13 @@ def main() -> int:
         help=f"serve it to Foxglove at a TCP port ({PORT})",
     )
     parser.add_argument("--live-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
-    parser.add_argument("--seconds", type=float, help="end after so many")
+    parser.add_argument("--top", action="store_true", help="show on this terminal how it comes; once when it is none")
+    parser.add_argument("--seconds", type=float, help=f"end after so many ({TOP_S:g} for --top alone on no terminal)")
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
     parser.add_argument("--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)")
     arguments = parser.parse_args()
-    if arguments.live is None and not arguments.record:
-        parser.error("say what to do with it: --record, --live")
+    if arguments.live is None and not arguments.record and not arguments.top:
+        parser.error("say what to do with it: --record, --live, --top")
     return exit_status(lambda: run(arguments))
 
 

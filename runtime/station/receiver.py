@@ -9,7 +9,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -33,7 +33,7 @@ class Sink(Protocol):
         """Called every REFRESH_S."""
 
     def end(self) -> str:
-        """Complete what was begun; what came of it, in a line."""
+        """Complete what was begun; what came of it, to be printed."""
 
 
 @dataclass
@@ -48,12 +48,12 @@ class Count:
 class Receiver:
     """Tells the streams' datagrams from all others."""
 
-    def __init__(self, known: Iterable[Stream], sinks: Sequence[Sink]) -> None:
+    def __init__(self, known: Iterable[Stream]) -> None:
         self.known = {(stream.address, stream.port): stream for stream in known}
         self.counts = {stream.topic: Count() for stream in self.known.values()}
         self.strangers = 0
         """Datagrams from addresses that are no robot's of a stream."""
-        self._sinks = sinks
+        self.sinks: list[Sink] = []
 
     def take(self, datagram: bytes, address: str, port: int, received_ns: int) -> None:
         """From an address, to a port of this computer; `received_ns` as for sinks."""
@@ -67,11 +67,11 @@ class Receiver:
             return
         count.received += 1
         values = stream.unpack(datagram)
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.take(stream, values, received_ns)
 
     def refresh(self) -> None:
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.refresh()
 
     @property
@@ -103,7 +103,7 @@ def listen(ports: Iterable[int], address: str) -> list[socket.socket]:
 
 
 def receive(
-    receiver: Receiver, sockets: list[socket.socket], seconds: float | None, note: Callable[[str], None]
+    receiver: Receiver, sockets: list[socket.socket], seconds: float | None, note: Callable[[str], None] | None
 ) -> None:
     """Until SIGINT or SIGTERM, or for so many seconds; `note` is told how far it is."""
     wake, waker = socket.socketpair()
@@ -122,7 +122,8 @@ def receive(
         if time.monotonic() - refreshed >= REFRESH_S:
             receiver.refresh()
             refreshed = time.monotonic()
-            note(f"{sum(count.received for count in receiver.counts.values())} messages")
+            if note:
+                note(f"{sum(count.received for count in receiver.counts.values())} messages")
     for one in sockets:  # what came before the end
         _drain(one, receiver)
 
