@@ -10,18 +10,20 @@ from pathlib import Path
 
 from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
+from images.builder.fleet import Fleet
 from runtime.station.live import PORT, Server
 from runtime.station.receiver import Receiver, listen, receive
 from runtime.station.record import Recorder
+from runtime.station.services import Services
 from runtime.station.telemetry import Stream, streams
 from runtime.station.top import Top
 
 TOP_S = 2.0
 
 
-def known_to(directory: Path) -> list[Stream]:
+def known_to(fleet: Fleet, directory: Path) -> list[Stream]:
     """The streams of the fleet that an inventory describes; there has to be one."""
-    known = streams(inventory.load_fleet(directory))
+    known = streams(fleet)
     if not known:
         raise UserError(
             f"{paths.shown(directory)}: no control task sends to a station; "
@@ -31,7 +33,8 @@ def known_to(directory: Path) -> list[Stream]:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    known = known_to(arguments.inventory)
+    fleet = inventory.load_fleet(arguments.inventory)
+    known = streams(fleet) if arguments.ask else known_to(fleet, arguments.inventory)
     sockets = listen((stream.port for stream in known), arguments.address)
     receiver = Receiver(known)
     doing = []
@@ -44,7 +47,8 @@ def run(arguments: argparse.Namespace) -> None:
             receiver.sinks.append(Recorder(known, arguments.record))
             doing.append("recording")
         if arguments.top:
-            top = Top(known, receiver.counts)
+            states = Services(fleet.robots.values()).states if arguments.ask else {}
+            top = Top(known, receiver.counts, states)
             receiver.sinks.append(top)
             if not doing and not top.console.is_terminal:
                 seconds = seconds or TOP_S
@@ -73,6 +77,7 @@ def main() -> int:
     )
     parser.add_argument("--live-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
     parser.add_argument("--top", action="store_true", help="show on this terminal how it comes; once when it is none")
+    parser.add_argument("--ask", action="store_true", help="with --top: ask robots whether their control tasks run")
     parser.add_argument("--seconds", type=float, help=f"end after so many ({TOP_S:g} for --top alone on no terminal)")
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
     parser.add_argument("--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)")

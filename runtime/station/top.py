@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from rich.console import Console
 from rich.live import Live
@@ -20,6 +21,7 @@ from rich.text import Text
 
 from runtime.station.receiver import Count
 from runtime.station.recording import CODES, Value
+from runtime.station.services import State
 from runtime.station.telemetry import Stream
 
 WINDOW_NS = 2_000_000_000
@@ -30,6 +32,8 @@ _HEALTH = ("good", "flag")
 _WIDTH = 120
 """Characters of a line that no terminal shows."""
 _TITLES = ("robot", "task", "stream", "Hz", "of", "came", "refused", "lost", "%", "age s", "flags")
+_RUNS = "runs"
+_LEFT = ("robot", "task", "stream", "flags", _RUNS)
 
 
 @dataclass(frozen=True)
@@ -89,14 +93,20 @@ class Heard:
 
 
 class Top:
-    """A sink of the receiver. `clock`: nanoseconds since 1970-01-01 UTC."""
+    """A sink of the receiver. `states`: of control tasks, by robot and task, if they are asked for. `clock`: ns
+    since 1970-01-01 UTC."""
 
     def __init__(
-        self, known: Iterable[Stream], counts: Mapping[str, Count], clock: Callable[[], int] = time.time_ns
+        self,
+        known: Iterable[Stream],
+        counts: Mapping[str, Count],
+        states: Mapping[tuple[str, str], State] = MappingProxyType({}),
+        clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self.console = Console()
         self._known = sorted(known, key=lambda stream: stream.topic)
         self._counts = counts
+        self._states = states
         self._clock = clock
         self._heard = {stream.topic: Heard(stream, clock()) for stream in self._known}
         self._live: Live | None = None
@@ -128,10 +138,12 @@ class Top:
     def _table(self) -> Table:
         now_ns = self._clock()
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 1, 0, 0))
-        for title in _TITLES:
-            table.add_column(title, justify="left" if title in ("robot", "task", "stream", "flags") else "right")
+        for title in (*_TITLES, _RUNS) if self._states else _TITLES:
+            table.add_column(title, justify="left" if title in _LEFT else "right")
+        silent_tasks = dict(self._states)
         for stream in self._known:
             row, count = self._heard[stream.topic].row(now_ns), self._counts[stream.topic]
+            silent_tasks.pop((stream.robot, stream.task), None)
             silent = row.age_s is None or row.age_s * stream.rate_hz > _LATE
             sent = count.received + (row.lost or 0)
             table.add_row(
@@ -146,12 +158,19 @@ class Top:
                 "" if row.lost is None or not sent else f"{100 * row.lost / sent:.1f}",
                 _marked("never" if row.age_s is None else f"{row.age_s:.2f}", silent),
                 Text(", ").join(_flag(name, share) for name, share in row.flags.items()),
+                *_runs(self._states.get((stream.robot, stream.task))),
             )
+        for (robot, task), state in silent_tasks.items():
+            table.add_row(robot, task, *[""] * (len(_TITLES) - 2), *_runs(state))
         return table
 
 
 def _marked(text: str, bad: bool) -> Text:
     return Text(text, style="bold red" if bad else "")
+
+
+def _runs(state: State | None) -> list[Text]:
+    return [_marked(state.words, not state.good)] if state else []
 
 
 def _flag(name: str, share: float) -> Text:

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 
 import pytest
 
-from runtime.station.receiver import Receiver
+from runtime.station.receiver import Count, Receiver
 from runtime.station.recording import Field
+from runtime.station.services import State
 from runtime.station.telemetry import Stream, of_task
 from runtime.station.top import Heard, Row, Top
 
@@ -94,6 +95,17 @@ def test_the_table_says_it() -> None:
         "robot task stream Hz of came refused lost % age s flags",
         "robot1 valves report 37.5 50 150 0 49 24.6 0.02 good, not flying",
         "robot2 control report 0.0 10 0 1 never",
+    ]
+
+
+def test_tasks_are_shown_with_streams_or_without() -> None:
+    """Seen to fail where tasks without streams are left out."""
+    states = {("robot1", "valves"): State("running 5 s", True), ("robot1", "heading"): State("no answer", False)}
+    top = Top([STREAM], {STREAM.topic: Count()}, states, clock=lambda: 0)
+    assert [" ".join(line.split()) for line in top.end().splitlines()] == [
+        "robot task stream Hz of came refused lost % age s flags runs",
+        "robot1 valves report 0.0 50 0 0 0 never running 5 s",
+        "robot1 heading no answer",
     ]
 
 
