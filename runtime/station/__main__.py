@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> None:
             doing.append("recording")
         if arguments.top:
             states = Services(fleet.robots.values()).states if arguments.ask else {}
-            top = Top(known, receiver.counts, states)
+            top = Top(receiver, states)
             receiver.sinks.append(top)
             if not doing and not top.console.is_terminal:
                 seconds = seconds or TOP_S
@@ -84,6 +84,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.live is None and not arguments.record and not arguments.top:
         parser.error("say what to do with it: --record, --live, --top")
+    if arguments.ask and not arguments.top:
+        parser.error("--ask: only --top shows it")
     return exit_status(lambda: run(arguments))
 
 

@@ -10,7 +10,7 @@ import contextlib
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from runtime.station.receiver import Count
+from runtime.station.receiver import Receiver
 from runtime.station.recording import CODES, Value
 from runtime.station.services import State
 from runtime.station.telemetry import Stream
@@ -93,19 +93,18 @@ class Heard:
 
 
 class Top:
-    """A sink of the receiver. `states`: of control tasks, by robot and task, if they are asked for. `clock`: ns
-    since 1970-01-01 UTC."""
+    """A sink of `receiver`. `states`: of control tasks, by robot and task, if they are asked for. `clock`: ns since
+    1970-01-01 UTC."""
 
     def __init__(
         self,
-        known: Iterable[Stream],
-        counts: Mapping[str, Count],
+        receiver: Receiver,
         states: Mapping[tuple[str, str], State] = MappingProxyType({}),
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self.console = Console()
-        self._known = sorted(known, key=lambda stream: stream.topic)
-        self._counts = counts
+        self._known = sorted(receiver.known.values(), key=lambda stream: stream.topic)
+        self._receiver = receiver
         self._states = states
         self._clock = clock
         self._heard = {stream.topic: Heard(stream, clock()) for stream in self._known}
@@ -142,7 +141,7 @@ class Top:
             table.add_column(title, justify="left" if title in _LEFT else "right")
         silent_tasks = dict(self._states)
         for stream in self._known:
-            row, count = self._heard[stream.topic].row(now_ns), self._counts[stream.topic]
+            row, count = self._heard[stream.topic].row(now_ns), self._receiver.counts[stream.topic]
             silent_tasks.pop((stream.robot, stream.task), None)
             silent = row.age_s is None or row.age_s * stream.rate_hz > _LATE
             sent = count.received + (row.lost or 0)
@@ -162,6 +161,9 @@ class Top:
             )
         for (robot, task), state in silent_tasks.items():
             table.add_row(robot, task, *[""] * (len(_TITLES) - 2), *_runs(state))
+        if self._receiver.strangers:
+            table.caption = f"{self._receiver.strangers} datagrams of strangers left out"
+            table.caption_justify = "left"
         return table
 
 

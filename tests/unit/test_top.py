@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from runtime.station.receiver import Count, Receiver
+from runtime.station.receiver import Receiver
 from runtime.station.recording import Field
 from runtime.station.services import State
 from runtime.station.telemetry import Stream, of_task
@@ -84,24 +84,26 @@ def test_the_table_says_it() -> None:
     now_ns = 0
     other = Stream("robot2", "control", "report", "10.42.0.2", 5021, STREAM.fields[1:], "<", 0.01, 10)
     receiver = Receiver([STREAM, other])
-    top = Top(receiver.known.values(), receiver.counts, clock=lambda: now_ns)
+    top = Top(receiver, clock=lambda: now_ns)
     receiver.sinks.append(top)
     for step in range(2, 402, 2):
         now_ns += 20_000_000
         if step % 8:
             receiver.take(step.to_bytes(2, "little") + b"\x01" + bytes(9), STREAM.address, STREAM.port, now_ns)
     receiver.take(b"short", other.address, other.port, now_ns)
+    receiver.take(bytes(12), "10.42.0.9", STREAM.port, now_ns)
     assert [" ".join(line.split()) for line in top.end().splitlines()] == [
         "robot task stream Hz of came refused lost % age s flags",
         "robot1 valves report 37.5 50 150 0 49 24.6 0.02 good, not flying",
         "robot2 control report 0.0 10 0 1 never",
+        "1 datagrams of strangers left out",
     ]
 
 
 def test_tasks_are_shown_with_streams_or_without() -> None:
     """Seen to fail where tasks without streams are left out."""
     states = {("robot1", "valves"): State("running 5 s", True), ("robot1", "heading"): State("no answer", False)}
-    top = Top([STREAM], {STREAM.topic: Count()}, states, clock=lambda: 0)
+    top = Top(Receiver([STREAM]), states, clock=lambda: 0)
     assert [" ".join(line.split()) for line in top.end().splitlines()] == [
         "robot task stream Hz of came refused lost % age s flags runs",
         "robot1 valves report 0.0 50 0 0 0 never running 5 s",
