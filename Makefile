@@ -98,7 +98,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param record
+.PHONY: runtime check-runtime fuzz bench-runtime param record live top
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -131,8 +131,16 @@ bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HA
 	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS)) \
 	    $(if $(ROUNDS),--rounds $(ROUNDS))
 
+# One program receives, since a port can be received at only once: what it does with it is told by variables too.
+station = $(PYTHON) -m runtime.station $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ADDRESS),--live-address $(ADDRESS))
 record: | setup ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS=]
-	$(Q)$(PYTHON) -m runtime.station.record $(OUT) $(if $(SECONDS),--seconds $(SECONDS))
+	$(Q)$(station) --record $(OUT) $(if $(PORT),--live $(PORT))
+
+live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
+	$(Q)$(station) --live $(PORT) $(if $(OUT),--record $(OUT))
+
+top: | setup ## how it comes: rate, loss, age, flags [SECONDS=]; also whether control tasks run: ASK=1; OUT= and PORT= as above
+	$(Q)$(station) --top $(if $(filter-out 0,$(ASK)),--ask) $(if $(OUT),--record $(OUT)) $(if $(PORT),--live $(PORT))
 
 param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
 	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))

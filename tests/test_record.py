@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import io
-import itertools
-import shutil
 import signal
 import socket
-import struct
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, SeekingReader
 
 from images.builder import inventory, paths
-from runtime.station import record, telemetry
+from runtime.station import telemetry
+from runtime.station.receiver import Receiver
+from runtime.station.record import Recorder
 from tests.running import PATIENCE, running
-
-FLEET = paths.PROJECT / "tests" / "scenarios" / "inventory"
+from tests.station import ADDRESS, FLEET, Messages, Robots, contiguous, message_class, on_loopback, station, steps
 
 SENDER = """
 period: 2 ms
@@ -44,9 +38,6 @@ blocks:
   out: {type: udp-send, in: {data: report.out}, parameters: {address: 127.0.0.1, port: PORT, length: 42}}
 """
 
-Messages = list[tuple[str, Any]]
-"""Topic and decoded message."""
-
 
 def decoded(file: Path, *, whole: bool = True) -> Messages:
     """All messages, decoded by the file's own schemas alone. A file that is not `whole` has no index and no end."""
@@ -58,10 +49,7 @@ def decoded(file: Path, *, whole: bool = True) -> Messages:
         for schema, channel, message in reader.iter_messages(log_time_order=whole):  # which would wait for the end
             assert schema is not None
             if schema.id not in kinds:
-                pool = descriptor_pool.DescriptorPool()
-                for each in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-                    pool.Add(each)
-                kinds[schema.id] = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+                kinds[schema.id] = message_class(schema.name, schema.data)
             assert message.sequence == sum(topic == channel.topic for topic, _ in found)
             found.append((channel.topic, kinds[schema.id].FromString(message.data)))
     except EndOfFile:
@@ -71,62 +59,7 @@ def decoded(file: Path, *, whole: bool = True) -> Messages:
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Path:
-    """The scenarios' fleet on this computer's loopback."""
-    directory = tmp_path / "inventory"
-    shutil.copytree(FLEET, directory)
-    for file in (directory / "robots.yml", directory / "group_vars" / "all.yml"):
-        file.write_text(file.read_text().replace("170.160.1.", "127.0.0."))
-    return directory
-
-
-@contextmanager
-def recording(fleet: Path, out: Path, *under: str) -> Iterator[subprocess.Popen[str]]:
-    argv = [*under, sys.executable, "-m", "runtime.station.record", str(out), "--inventory", str(fleet)]
-    with subprocess.Popen(
-        [*argv, "--address", "127.0.0.254"],
-        cwd=paths.PROJECT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-class Robots:
-    """Send what the tasks `valves` and `control` would; numbers go up by one."""
-
-    def __init__(self, fleet: Path) -> None:
-        self.streams = {stream.task: stream for stream in telemetry.streams(inventory.load_fleet(fleet))}
-        self.sent = dict.fromkeys(self.streams, 0)
-
-    def send(self, task: str, datagram: bytes | None = None, address: str = "") -> None:
-        stream = self.streams[task]
-        if datagram is None:
-            datagram = struct.pack("<Q", self.sent[task]) + bytes(stream.length - 8)
-            self.sent[task] += 1
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-            one.bind((address or stream.address, 0))
-            one.sendto(datagram, ("127.0.0.254", stream.port))
-
-    def until(self, what: Callable[[], bool]) -> None:
-        """Send from both, a hundred times a second, until something has come of it."""
-        end = time.monotonic() + PATIENCE
-        while not what():
-            assert time.monotonic() < end
-            for task in self.streams:
-                self.send(task)
-            time.sleep(0.01)  # the rate of the robots
-
-
-def steps(messages: Messages, topic: str) -> list[int]:
-    return [message.step for name, message in messages if name == topic]
-
-
-def contiguous(numbers: list[int]) -> bool:
-    return all(after == before + 1 for before, after in itertools.pairwise(numbers))
+    return on_loopback(tmp_path / "inventory")
 
 
 def grown(file: Path, size: int) -> Callable[[], bool]:
@@ -151,11 +84,13 @@ def test_what_a_task_packs_is_what_is_read(flotilla_run: Path, tmp_path: Path) -
         assert stream.length == 42
         one.settimeout(PATIENCE)
         out = tmp_path / "a.mcap"
-        with running([flotilla_run], tmp_path / "sender.yml", text), out.open("xb") as file:
-            recorder = record.Recorder([stream], file)
+        recorder = Recorder([stream], out)
+        receiver = Receiver([stream])
+        receiver.sinks.append(recorder)
+        with running([flotilla_run], tmp_path / "sender.yml", text):
             for _ in range(50):
-                recorder.take(one.recv(100), "127.0.0.1", stream.port, time.time_ns())
-            recorder.end()
+                receiver.take(one.recv(100), "127.0.0.1", stream.port, time.time_ns())
+        recorder.end()
     messages = [message for _, message in decoded(out)]
     assert contiguous([message.step for message in messages])
     assert len(messages) == 50
@@ -166,7 +101,7 @@ def test_what_a_task_packs_is_what_is_read(flotilla_run: Path, tmp_path: Path) -
 
 def test_all_that_was_sent_is_recorded_and_nothing_else(fleet: Path, tmp_path: Path) -> None:
     robots, out = Robots(fleet), tmp_path / "a.mcap"
-    with recording(fleet, out) as process:
+    with station(fleet, "--record", out) as process:
         robots.until(grown(out, 2000))
         robots.send("valves", b"short")
         robots.send("valves", address="127.0.0.9")
@@ -183,13 +118,13 @@ def test_all_that_was_sent_is_recorded_and_nothing_else(fleet: Path, tmp_path: P
     for task, stream in robots.streams.items():
         recorded = steps(messages, stream.topic)
         assert recorded == list(range(begun[task], robots.sent[task]))
-        assert f"{stream.topic}: {len(recorded)} recorded" in said
+        assert f"{stream.topic}: {len(recorded)} received" in said
 
 
 def test_a_killed_recorder_leaves_what_it_had(fleet: Path, tmp_path: Path) -> None:
     """Seen to fail without the flush each second: the file is empty."""
     robots, out = Robots(fleet), tmp_path / "a.mcap"
-    with recording(fleet, out) as process:
+    with station(fleet, "--record", out) as process:
         robots.until(grown(out, 4000))
         process.kill()
         process.wait(PATIENCE)
@@ -202,7 +137,7 @@ def test_a_killed_recorder_leaves_what_it_had(fleet: Path, tmp_path: Path) -> No
 def test_a_full_disk_leaves_what_was_recorded(fleet: Path, tmp_path: Path) -> None:
     """A limit on the file's size stands in for the disk's. Seen to fail without cutting off the half chunk."""
     robots, out = Robots(fleet), tmp_path / "a.mcap"
-    with recording(fleet, out, "prlimit", "--fsize=20000") as process:
+    with station(fleet, "--record", out, under=("prlimit", "--fsize=20000")) as process:
         robots.until(lambda: process.poll() is not None)
         said, complaints = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1, said
@@ -216,13 +151,13 @@ def test_a_full_disk_leaves_what_was_recorded(fleet: Path, tmp_path: Path) -> No
 def test_what_cannot_be_recorded_is_said(fleet: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     out.write_text("precious")
-    with recording(fleet, out) as process:
+    with station(fleet, "--record", out) as process:
         assert "a.mcap is there already" in process.communicate(timeout=PATIENCE)[1]
     assert out.read_text() == "precious"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.254", 5020))
-        with recording(fleet, tmp_path / "b.mcap") as process:
+        one.bind((ADDRESS, 5020))
+        with station(fleet, "--record", tmp_path / "b.mcap") as process:
             assert "UDP port 5020 of 127.0.0.254: Address already in use" in process.communicate(timeout=PATIENCE)[1]
-    with recording(paths.INVENTORY, tmp_path / "b.mcap") as process:
+    with station(paths.INVENTORY, "--record", tmp_path / "b.mcap") as process:
         assert "no control task sends to a station" in process.communicate(timeout=PATIENCE)[1]
     assert not (tmp_path / "b.mcap").exists()

@@ -18,6 +18,7 @@ from images.builder.fleet import Fleet
 from runtime.station.recording import Field, Value
 
 _BYTE_ORDERS = {"little": "<", "big": ">"}
+_SECONDS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,20 @@ class Stream:
     fields: tuple[Field, ...]
     byte_order: str
     """Of struct(3): `<` or `>`."""
+    step_s: float
+    """The task's period."""
+    every: int
+    """Steps of the task from one datagram to the next."""
 
     @property
     def length(self) -> int:
         """Bytes of a datagram."""
         return self.fields[-1].end
+
+    @property
+    def rate_hz(self) -> float:
+        """Datagrams in a second when nothing is late or lost."""
+        return 1 / (self.step_s * self.every)
 
     @property
     def topic(self) -> str:
@@ -83,7 +93,23 @@ def of_task(robot: str, address: str, name: str, task: dict[str, Any], stations:
         widths = [int(width) for width in layout.get("widths") or ["1"] * len(types)]
         fields = tuple(_fields(names, types, widths, int(layout.get("alignment", 1))))
         byte_order = _BYTE_ORDERS[layout.get("byte_order", "little")]
-        yield Stream(robot, name, packer, address, int(parameters["port"]), fields, byte_order)
+        yield Stream(
+            robot,
+            name,
+            packer,
+            address,
+            int(parameters["port"]),
+            fields,
+            byte_order,
+            step_s=_duration_s(task["period"]),
+            every=int(sender.get("every", 1)),
+        )
+
+
+def _duration_s(text: str) -> float:
+    """Of a task file's `10 ms`, which the runtime has checked."""
+    number = text.rstrip("nuµms ")
+    return float(number) * _SECONDS[text[len(number) :].strip()]
 
 
 def _fields(names: Sequence[str], types: Sequence[str], widths: Sequence[int], alignment: int) -> Iterator[Field]:

@@ -1,0 +1,100 @@
+"""Whether control tasks run: asked of each robot by ssh every ASK_S, over one connection that stays."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import threading
+import time
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass
+
+from images.builder import boot
+from images.builder.errors import UserError
+from images.builder.fleet import Robot
+
+ASK_S = 5
+_END = "."
+_PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
+_SETTINGS = ("ConnectTimeout=5", "ServerAliveInterval=5", "ServerAliveCountMax=2")
+
+
+@dataclass(frozen=True)
+class State:
+    """Of a control task's service."""
+
+    words: str
+    """`running 75 s`, `failed`: the service manager's, and since when."""
+    good: bool
+    """It runs, and has done so since it was started."""
+
+
+def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
+    """Its tasks by name, again and again, until UserError says why it does not answer any more."""
+    units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
+    longest = 1 + len(units) * (len(_PROPERTIES) + 1)  # lines of an answer
+    show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
+    script = f"while cat /proc/uptime && {show} && echo {_END}; do sleep {ASK_S}; done"
+    program, *way = boot.ssh_command(robot)
+    options = [word for setting in _SETTINGS for word in ("-o", setting)]
+    argv = [*boot.DIE_WITH_PARENT, program, *options, *way, shlex.join(["sudo", "sh", "-c", script])]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True) as process:
+        try:
+            assert process.stdout
+            assert process.stderr
+            lines: list[str] = []
+            for line in process.stdout:
+                if line.rstrip() != _END and len(lines) < longest:
+                    lines.append(line)
+                    continue
+                try:
+                    yield _states("".join(lines))
+                except (ValueError, KeyError) as error:
+                    raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {error!r}") from error
+                lines = []
+            raise boot.no_answer(robot, process.stderr.read().strip() or "the connection broke")
+        finally:
+            process.kill()
+
+
+def _states(said: str) -> dict[str, State]:
+    """What one round says: /proc/uptime, then the services, an empty line between them."""
+    uptime, _, shown = said.partition("\n")
+    found = {}
+    for block in shown.strip().split("\n\n"):
+        unit = dict(line.split("=", 1) for line in block.splitlines())
+        task = unit["Id"].removeprefix("flotilla-task@").removesuffix(".service")
+        active = unit["ActiveState"] == "active"
+        since_s = float(uptime.split()[0]) - int(unit["ActiveEnterTimestampMonotonic"]) / 1e6
+        restarts = int(unit["NRestarts"])
+        words = (
+            unit["SubState"]
+            + (f" {since_s:.0f} s" if active else "")
+            + (f", restarted {restarts}×" if restarts else "")
+        )
+        found[task] = State(words, active and not restarts)
+    return found
+
+
+class Services:
+    """Asks robots that have control tasks, by a thread each, which ends with the process. UserError without keys."""
+
+    def __init__(self, robots: Iterable[Robot]) -> None:
+        asked = [robot for robot in robots if robot.control_tasks]
+        self.states = {(robot.name, task): State("asked", True) for robot in asked for task in robot.control_tasks}
+        """By robot and task, as they were told last."""
+        for robot in asked:
+            boot.ssh_command(robot)
+            threading.Thread(target=self._follow, args=(robot,), daemon=True).start()
+
+    def _follow(self, robot: Robot) -> None:
+        while True:
+            try:
+                for states in ask(robot):
+                    for task, state in states.items():
+                        self.states[robot.name, task] = state
+            except UserError:
+                for task in robot.control_tasks:
+                    self.states[robot.name, task] = State("no answer", False)
+            time.sleep(ASK_S)

@@ -1,0 +1,92 @@
+"""What tests of the station need: the real program, robots that tell it something, and what a viewer does."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from images.builder import inventory, paths
+from runtime.station import telemetry
+from tests.running import PATIENCE
+
+FLEET = paths.PROJECT / "tests" / "scenarios" / "inventory"
+ADDRESS = "127.0.0.254"
+"""The station's in the fleet on loopback."""
+
+Messages = list[tuple[str, Any]]
+"""Topic and decoded message."""
+
+
+def on_loopback(directory: Path) -> Path:
+    """The scenarios' fleet on this computer's loopback, in an inventory that is made."""
+    shutil.copytree(FLEET, directory)
+    for file in (directory / "robots.yml", directory / "group_vars" / "all.yml"):
+        file.write_text(file.read_text().replace("170.160.1.", "127.0.0."))
+    return directory
+
+
+@contextmanager
+def station(fleet: Path, *options: str | Path, under: tuple[str, ...] = ()) -> Iterator[subprocess.Popen[str]]:
+    """The program with `options`, run by the command line `under`."""
+    argv = [*under, sys.executable, "-m", "runtime.station", *options, "--inventory", fleet, "--address", ADDRESS]
+    with subprocess.Popen(
+        argv, cwd=paths.PROJECT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def message_class(name: str, descriptors: bytes) -> type[Any]:
+    """Of a protobuf schema, as a viewer makes it: `descriptors` is a FileDescriptorSet."""
+    pool = descriptor_pool.DescriptorPool()
+    for each in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
+        pool.Add(each)
+    found: type[Any] = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    return found
+
+
+class Robots:
+    """Send what the tasks `valves` and `control` would; numbers go up by one."""
+
+    def __init__(self, fleet: Path) -> None:
+        self.streams = {stream.task: stream for stream in telemetry.streams(inventory.load_fleet(fleet))}
+        self.sent = dict.fromkeys(self.streams, 0)
+
+    def send(self, task: str, datagram: bytes | None = None, address: str = "") -> None:
+        stream = self.streams[task]
+        if datagram is None:
+            datagram = struct.pack("<Q", self.sent[task]) + bytes(stream.length - 8)
+            self.sent[task] += 1
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+            one.bind((address or stream.address, 0))
+            one.sendto(datagram, (ADDRESS, stream.port))
+
+    def until(self, what: Callable[[], bool]) -> None:
+        """Send from both, a hundred times a second, until something has come of it."""
+        end = time.monotonic() + PATIENCE
+        while not what():
+            assert time.monotonic() < end
+            for task in self.streams:
+                self.send(task)
+            time.sleep(0.01)  # the rate of the robots
+
+
+def steps(messages: Messages, topic: str) -> list[int]:
+    return [message.step for name, message in messages if name == topic]
+
+
+def contiguous(numbers: list[int]) -> bool:
+    return all(after == before + 1 for before, after in itertools.pairwise(numbers))

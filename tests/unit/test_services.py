@@ -1,0 +1,90 @@
+"""What robots say of their control tasks' services, and what becomes of it; ssh runs it in a shell here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from ipaddress import IPv4Address
+from pathlib import Path
+
+import pytest
+
+from images.builder import boot
+from images.builder.errors import UserError
+from images.builder.fleet import Robot
+from runtime.station.services import State, ask
+
+ROBOT = Robot(
+    name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"), control_tasks=["valves", "sensors"]
+)
+SSH = """#!/bin/sh
+while [ "$1" = -o ]; do shift 2; done
+PATH="{directory}:$PATH" exec sh -c "$*"
+"""
+
+
+def unit(task: str, active: str, sub: str, restarts: int, since_us: int) -> str:
+    """As systemd 252 says it, in its own order."""
+    return f"""NRestarts={restarts}
+Id=flotilla-task@{task}.service
+ActiveState={active}
+SubState={sub}
+ActiveEnterTimestampMonotonic={since_us}
+"""
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A directory of the robot's programs; it says what a file `said` in it has, and has been up for 153.54 s."""
+    program(tmp_path, "ssh", SSH.format(directory=tmp_path))
+    program(tmp_path, "sudo", '#!/bin/sh\nexec "$@"\n')
+    program(tmp_path, "cat", '#!/bin/sh\n[ "$*" = /proc/uptime ] && echo 153.54 93.80\n')
+    program(tmp_path, "sleep", "#!/bin/sh\n")
+    asked = "--property=Id,ActiveState,SubState,NRestarts,ActiveEnterTimestampMonotonic"
+    words = f"show {asked} flotilla-task@valves.service flotilla-task@sensors.service"
+    program(tmp_path, "systemctl", f'#!/bin/sh\n[ "$*" = "{words}" ] && exec /bin/cat {tmp_path}/said\n')
+    monkeypatch.setattr(boot, "ssh_command", lambda _: [str(tmp_path / "ssh")])
+    return tmp_path
+
+
+def program(directory: Path, name: str, script: str) -> None:
+    (directory / name).write_text(script)
+    (directory / name).chmod(0o755)
+
+
+def say(robot: Path, *units: str) -> None:
+    beside = robot / "said.new"
+    beside.write_text("\n".join(units))
+    beside.rename(robot / "said")
+
+
+def test_what_services_do(robot: Path) -> None:
+    """Seen to fail with restarts that do no harm, and with the boot's time for the task's."""
+    say(robot, unit("valves", "active", "running", 0, 148562559), unit("sensors", "active", "running", 2, 53540000))
+    with closing(ask(ROBOT)) as answers:
+        assert next(answers) == {
+            "valves": State("running 5 s", True),
+            "sensors": State("running 100 s, restarted 2×", False),
+        }
+        say(robot, unit("valves", "inactive", "dead", 0, 0), unit("sensors", "activating", "auto-restart", 7, 0))
+        changed = {"valves": State("dead", False), "sensors": State("auto-restart, restarted 7×", False)}
+        assert until(answers, changed)
+
+
+def until(answers: Iterator[dict[str, State]], wanted: dict[str, State]) -> bool:
+    """One of the next answers is that: some were given before the change."""
+    return any(answer == wanted for answer, _ in zip(answers, range(10000), strict=False))
+
+
+def test_one_that_does_not_answer(robot: Path) -> None:
+    program(robot, "ssh", "#!/bin/sh\necho 'ssh: connect to host: No route' >&2; exit 255\n")
+    with pytest.raises(UserError, match=r"^robot3 did not answer: ssh: connect to host: No route; is it on"):
+        next(ask(ROBOT))
+
+
+@pytest.mark.parametrize("said", ["Failed to connect\n", "without an end "])
+def test_one_that_talks_nonsense(robot: Path, said: str) -> None:
+    """Seen to hang without a limit to what is read."""
+    say(robot, said)
+    with pytest.raises(UserError, match=r"^robot3: nobody understands"):
+        next(ask(ROBOT))

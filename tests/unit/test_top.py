@@ -1,0 +1,130 @@
+"""What `make top` says of streams, by a clock of the tests'."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+
+from runtime.station.receiver import Receiver
+from runtime.station.recording import Field
+from runtime.station.services import State
+from runtime.station.telemetry import Stream, of_task
+from runtime.station.top import Heard, Row, Top
+
+SECOND_NS = 1_000_000_000
+STREAM = Stream(
+    robot="robot1",
+    task="valves",
+    block="report",
+    address="10.42.0.1",
+    port=5020,
+    fields=(
+        Field("step", "uint16", 1, 0),
+        Field("good", "boolean", 1, 2),
+        Field("valves", "boolean", 8, 3),
+        Field("flying", "boolean", 1, 11),
+    ),
+    byte_order="<",
+    step_s=0.01,
+    every=2,
+)
+
+
+def heard(steps: Iterable[int], bad: Iterable[int] = ()) -> Row:
+    """A row right after datagrams with these steps, one each 20 ms; those in `bad` have good = 0."""
+    found = Heard(STREAM, 0)
+    now_ns = 0
+    for step in steps:
+        now_ns += 20_000_000
+        found.take({"step": step, "good": step not in bad, "valves": (True,) * 8, "flying": True}, now_ns)
+    return found.row(now_ns)
+
+
+def test_all_came() -> None:
+    """In less than the window too. Seen to fail without regard to that."""
+    assert heard(range(2, 52, 2)) == Row(rate_hz=50, lost=0, age_s=0, flags={"good": 1, "flying": 1})
+    assert heard(range(2, 402, 2)) == Row(rate_hz=50, lost=0, age_s=0, flags={"good": 1, "flying": 1})
+
+
+@pytest.mark.parametrize(
+    ("steps", "lost"),
+    [
+        ([100, 102, 104], 0),
+        ([100, 106, 108], 2),
+        ([100, 104, 102, 106], 0),  # overtaken
+        ([100, 100, 102], 0),  # twice: the task stepped by itself
+        ([65532, 65534, 0, 2], 0),  # after the largest
+        ([65532, 4], 3),
+        ([5000, 2, 8], 2),  # the robot starts anew
+        ([0, 0, 700, 702], 0),  # nothing had reached the task
+    ],
+)
+def test_lost_are_steps_that_did_not_come(steps: list[int], lost: int) -> None:
+    """Each was seen to fail: with `every`, overtaking, the largest number, a start anew or 0 left out."""
+    assert heard(steps).lost == lost
+
+
+def test_a_silent_stream_has_age_and_no_rate() -> None:
+    """Its flags are the last ones. Seen to fail where the window ends with the last datagram."""
+    found = Heard(STREAM, 0)
+    found.take({"step": 1, "good": False, "valves": (True,) * 8, "flying": True}, SECOND_NS)
+    assert found.row(2 * SECOND_NS) == Row(rate_hz=0.5, lost=0, age_s=1, flags={"good": 0, "flying": 1})
+    assert found.row(9 * SECOND_NS) == Row(rate_hz=0, lost=0, age_s=8, flags={"good": 0, "flying": 1})
+    assert Heard(STREAM, 0).row(SECOND_NS) == Row(rate_hz=0, lost=0, age_s=None, flags={})
+
+
+def test_flags_are_those_of_the_window() -> None:
+    assert heard(range(2, 402, 2), bad=range(2, 200, 2)).flags == {"good": 1, "flying": 1}
+    assert heard(range(2, 402, 2), bad=range(302, 402, 2)).flags == {"good": 0.5, "flying": 1}
+
+
+def test_the_table_says_it() -> None:
+    """Seen to fail with columns exchanged."""
+    now_ns = 0
+    other = Stream("robot2", "control", "report", "10.42.0.2", 5021, STREAM.fields[1:], "<", 0.01, 10)
+    receiver = Receiver([STREAM, other])
+    top = Top(receiver, clock=lambda: now_ns)
+    receiver.sinks.append(top)
+    for step in range(2, 402, 2):
+        now_ns += 20_000_000
+        if step % 8:
+            receiver.take(step.to_bytes(2, "little") + b"\x01" + bytes(9), STREAM.address, STREAM.port, now_ns)
+    receiver.take(b"short", other.address, other.port, now_ns)
+    receiver.take(bytes(12), "10.42.0.9", STREAM.port, now_ns)
+    assert [" ".join(line.split()) for line in top.end().splitlines()] == [
+        "robot task stream Hz of came refused lost % age s flags",
+        "robot1 valves report 37.5 50 150 0 49 24.6 0.02 good, not flying",
+        "robot2 control report 0.0 10 0 1 never",
+        "1 datagrams of strangers left out",
+    ]
+
+
+def test_tasks_are_shown_with_streams_or_without() -> None:
+    """Seen to fail where tasks without streams are left out."""
+    states = {("robot1", "valves"): State("running 5 s", True), ("robot1", "heading"): State("no answer", False)}
+    top = Top(Receiver([STREAM]), states, clock=lambda: 0)
+    assert [" ".join(line.split()) for line in top.end().splitlines()] == [
+        "robot task stream Hz of came refused lost % age s flags runs",
+        "robot1 valves report 0.0 50 0 0 0 never running 5 s",
+        "robot1 heading no answer",
+    ]
+
+
+def test_the_rate_is_the_task_file_s() -> None:
+    task = {
+        "period": "2.5 ms",
+        "blocks": {
+            "report": {"type": "pack", "parameters": {"types": ["double"]}},
+            "out": {
+                "type": "udp-send",
+                "every": "4",
+                "in": {"data": "report.out"},
+                "parameters": {"address": "10.42.0.254", "port": "5020"},
+            },
+        },
+    }
+    (stream,) = of_task("robot1", "10.42.0.1", "valves", task, {"10.42.0.254"})
+    assert (stream.step_s, stream.every, stream.rate_hz) == pytest.approx((0.0025, 4, 100))
+    (stream,) = of_task("robot1", "10.42.0.1", "valves", task | {"period": "500us"}, {"10.42.0.254"})
+    assert stream.rate_hz == pytest.approx(500)
