@@ -435,7 +435,7 @@ def _compiled(unit: Unit, found: Sources, architecture: str) -> bytes:
         tree = Path(directory) / "source"
         shutil.copytree(unit.directory / "sources", tree / "sources")
         shutil.copytree(HEADERS, tree / "fmi")
-        options = ["-std=gnu17", "-Wall", "-Wl,-Bsymbolic", "-Isources", "-Ifmi", *found.options]
+        options = ["-std=gnu17", "-Wall", "-Wl,-Bsymbolic,-z,defs", "-Isources", "-Ifmi", *found.options]
         return runtime.compile_shared(tree, [f"sources/{name}" for name in found.files], architecture, options)
 
 
