@@ -206,6 +206,7 @@ STEPS = {
 def test_a_step_that_a_unit_refuses_ends_the_task(
     flotilla_run: Path, apps: dict[str, Path], status: str, said: str
 ) -> None:
+    """In its own words, which are still heard: seen to fail with logging ended when real time begins."""
     task = "period: 10 ms\npriority: 0\nblocks:\n" + STATUS.replace("STATUS", status)
     with pytest.raises(AssertionError, match=f"unit: {re.escape(said)}"):
         run(flotilla_run, build(apps["3"]), task)

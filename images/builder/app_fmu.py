@@ -35,6 +35,8 @@ _PLATFORMS = {
     ("2", "i386"): "linux32", ("2", "amd64"): "linux64", ("3", "i386"): "x86-linux", ("3", "amd64"): "x86_64-linux",
 }  # fmt: skip
 """Folder of binaries, by FMI's version and Debian's name of the architecture."""
+_FAILURES = ("logStatusDiscard", "logStatusError", "logStatusFatal")
+"""FMI's categories of messages about steps that fail."""
 _MACHINES = {"i386": (1, 3), "amd64": (2, 62)}
 """ELF's class and machine."""
 _SIGNALS = {
@@ -113,6 +115,8 @@ class Unit:
     """The period has to be a multiple of that."""
     step_key: str
     """What says so."""
+    failures: list[str] = field(default_factory=list)
+    """Categories of messages that it knows and that are heard in real time, too: after them the task ends."""
     inputs: list[Variable] = field(default_factory=list)
     outputs: list[Variable] = field(default_factory=list)
     parameters: list[Variable] = field(default_factory=list)
@@ -199,6 +203,8 @@ def read(directory: Path, shown: str) -> Unit:
     step_key, step_s = _fixed_step(root, interface, file)
     once = _true(interface, "canBeInstantiatedOnlyOncePerProcess")
     unit = Unit(directory, file, version, identifier, token, once, step_s, step_key)
+    categories = [each.get("name", "") for each in root.iterfind("LogCategories/Category")]
+    unit.failures = [name for name in _FAILURES if name in categories]
     unit.listed = [each.get("name", "") for each in interface.iterfind("SourceFiles/File")]
     _variables(unit, root)
     return unit
@@ -421,6 +427,7 @@ def build(unit: Unit, name: str, architecture: str, out: Path) -> None:
     final.parent.mkdir(parents=True)
     if found := sources(unit, architecture):
         final.write_bytes(_compiled(unit, found, architecture))
+        final.chmod(0o755)  # as linkers leave it
     else:
         place = binary(unit, architecture)
         shutil.copytree(place, final.parent, dirs_exist_ok=True)

@@ -21,7 +21,7 @@ struct unit {
     int64_t sense;
     int32_t status;
     uint16_t steps;
-    bool hold;
+    bool hold, quiet;
     char label[32];
     fmi3InstanceEnvironment environment;
     fmi3LogMessageCallback log;
@@ -29,7 +29,8 @@ struct unit {
 
 static fmi3Status no(const struct unit *unit, const char *message)
 {
-    unit->log(unit->environment, fmi3Error, "logStatusError", message);
+    if (!unit->quiet)
+        unit->log(unit->environment, fmi3Error, "logStatusError", message);
     return fmi3Error;
 }
 
@@ -66,7 +67,9 @@ void fmi3FreeInstance(fmi3Instance instance)
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t count, const fmi3String categories[])
 {
-    return fmi3OK;
+    struct unit *unit = instance;
+    unit->quiet = !on;
+    return !on || (count == 1 && strcmp(categories[0], "logStatusError") == 0) ? fmi3OK : no(unit, "no such category");
 }
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolerance_defined, fmi3Float64 tolerance,
