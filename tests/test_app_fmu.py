@@ -320,6 +320,7 @@ BAD = {
     "no identifier": ("3", '"TwoLags"', '"Two lags"', "modelIdentifier: Two lags: is no identifier of C"),
     "no guid": ("2", " guid=", " other=", "guid: (nothing): is missing, so the code would not know its description"),
     "no token": ("3", " instantiationToken=", " other=", "instantiationToken: (nothing): is missing"),
+    "no finite step size": ("3", '"0.005"', '"INF"', "fixedInternalStepSize: INF: is no time; a number of seconds"),
     "no step size": ("3", '"0.005"', '"-1"', "fixedInternalStepSize: -1: is no time; a number of seconds above 0"),
     "no type": ("2", '<Real start="0"/>', '<Whole start="0"/>', "u: ScalarVariable: is no type of FMI"),
     "no reference": ("3", 'valueReference="1"', 'valueReference="x"', "u.valueReference: x: is no number"),
@@ -389,6 +390,14 @@ def test_a_binary_for_another_architecture(apps: dict[str, Path]) -> None:
     (unit.directory / "binaries" / "linux32" / "lag.so").write_text("MZ")
     with pytest.raises(UserError, match=r"linux32/lag\.so: is no shared object for a PC, not for i386"):
         app_fmu.binary(unit, "i386")
+
+
+def test_a_unit_that_is_too_large(apps: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    make_binary(apps["2"], "2")
+    read(apps["2"])
+    monkeypatch.setattr(app_fmu, "_MOST_BYTES", 4096)
+    with pytest.raises(UserError, match=r"exported\.fmu: unpacks to 0 MiB; at most 0 MiB fit a robot"):
+        read(apps["2"])
 
 
 def test_units_that_are_missing_or_too_many(apps: dict[str, Path]) -> None:

@@ -13,6 +13,7 @@ import shutil
 import struct
 import tempfile
 import zipfile
+import zlib
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -159,7 +160,7 @@ def unpacked(directory: Path, wanted: str | None, work: Path) -> tuple[Path, str
             if size > _MOST_BYTES:
                 raise UserError(f"{shown}: unpacks to {size >> 20} MiB; at most {_MOST_BYTES >> 20} MiB fit a robot")
             archive.extractall(work)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
         raise UserError(f"{shown}: is not a unit: {error}; export it anew") from None
     return work, shown
 
@@ -219,7 +220,7 @@ def _fixed_step(root: ElementTree.Element, interface: ElementTree.Element, file:
     for key, element in places:
         if (text := element.get(key)) is not None:
             step_s = _number(text)
-            if step_s is None or step_s <= 0:
+            if step_s is None or not 0 < step_s < math.inf:
                 raise _wrong(file, key, text, "is no time", "a number of seconds above 0")
             return key, step_s
     return "", None
@@ -239,8 +240,7 @@ def _variables(unit: Unit, root: ElementTree.Element) -> None:
         if unit.version == "2":
             typed = next((child for child in element if ("2", child.tag) in _SIGNALS), element)
         variable = _variable(unit, element, typed, types.get(typed.get("declaredType")))
-        supported = variable is not None and (variable.type != "text" if causality != "parameter" else True)
-        if variable and supported and not (causality == "parameter" and variable.array and not _reals(variable)):
+        if variable and _fits(variable, parameter=causality == "parameter"):
             lists[causality].append(variable)
     for kind, variables in (("input", unit.inputs), ("output", unit.outputs), ("parameter", unit.parameters)):
         names = Counter(variable.name for variable in variables)
@@ -250,9 +250,11 @@ def _variables(unit: Unit, root: ElementTree.Element) -> None:
                 raise _wrong(unit.file, "name", variable.original, message, "give it another name in the model")
 
 
-def _reals(variable: Variable) -> bool:
-    """Whether an array can be a list of numbers in a task file."""
-    return variable.type not in ("boolean", "text")
+def _fits(variable: Variable, *, parameter: bool) -> bool:
+    """Whether blocks have such ports, or such parameters. Without its variable a unit goes by what that starts with."""
+    if not parameter:
+        return variable.type != "text"
+    return not variable.array or variable.type not in ("boolean", "text")
 
 
 def _variable(
