@@ -320,6 +320,12 @@ BAD = {
     "no identifier": ("3", '"TwoLags"', '"Two lags"', "modelIdentifier: Two lags: is no identifier of C"),
     "no guid": ("2", " guid=", " other=", "guid: (nothing): is missing, so the code would not know its description"),
     "no token": ("3", " instantiationToken=", " other=", "instantiationToken: (nothing): is missing"),
+    "too large": (
+        "3",
+        '<Dimension start="2"/>',
+        '<Dimension start="5000"/>',
+        "ModelVariables: 5002: are too many inputs",
+    ),
     "no finite step size": ("3", '"0.005"', '"INF"', "fixedInternalStepSize: INF: is no time; a number of seconds"),
     "no step size": ("3", '"0.005"', '"-1"', "fixedInternalStepSize: -1: is no time; a number of seconds above 0"),
     "no type": ("2", '<Real start="0"/>', '<Whole start="0"/>', "u: ScalarVariable: is no type of FMI"),

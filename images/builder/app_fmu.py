@@ -32,6 +32,8 @@ UNPACKED = "unit"
 """Folder of an app with what was in a unit, where it is not packed."""
 _MOST_BYTES = 512 << 20
 """Of a unit, unpacked."""
+_MOST_VALUES = 4096
+"""Of all ports of a direction, or of all parameters: a step has them on the control thread's stack."""
 _PLATFORMS = {
     ("2", "i386"): "linux32", ("2", "amd64"): "linux64", ("3", "i386"): "x86-linux", ("3", "amd64"): "x86_64-linux",
 }  # fmt: skip
@@ -243,6 +245,12 @@ def _variables(unit: Unit, root: ElementTree.Element) -> None:
         if variable and _fits(variable, parameter=causality == "parameter"):
             lists[causality].append(variable)
     for kind, variables in (("input", unit.inputs), ("output", unit.outputs), ("parameter", unit.parameters)):
+        if (values := sum(variable.width for variable in variables)) > _MOST_VALUES:
+            message, remedy = (
+                f"are too many {kind}s for a block",
+                f"export it with {_MOST_VALUES} at most, arrays included",
+            )
+            raise _wrong(unit.file, "ModelVariables", str(values), message, remedy)
         names = Counter(variable.name for variable in variables)
         for variable in variables:
             if names[variable.name] > 1:
