@@ -55,7 +55,7 @@ provision: | setup ## robots become what the inventory says: make provision [ROB
 
 ##@ Apps
 .PHONY: new-app deploy
-new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|make NAME=hover
+new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|fmu|make NAME=hover
 	$(Q)$(FLOTILLA) new-app --kind $(call need,KIND) --name $(call need,NAME)
 
 deploy: | setup ## build, send and run an app: make deploy ROBOT=3 APP=dir [KEEP=1 | RUN=start|stop|status|log|remove]

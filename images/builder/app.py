@@ -20,7 +20,7 @@ TASK = "task.yml"
 SAFE = "safe.yml"
 """A task of actuators alone: what a program's outputs are, so that they are reset when it has ended."""
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,31}")
-Program = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*$")]
+Inside = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*$")]
 
 Identifier = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 
@@ -44,7 +44,7 @@ class Make(_Description):
     """A Makefile that makes one program."""
 
     kind: Literal["make"]
-    program: Program
+    program: Inside
     """What it makes, relative to the app."""
     arguments: list[str] = []
     """What the program is called with."""
@@ -63,10 +63,18 @@ class Ert(_Description):
     """Of its step functions in seconds, fastest first, where comments in the code do not say."""
 
 
-Description = Block | Make | Ert
-_MODELS: dict[str, type[_Description]] = {"block": Block, "make": Make, "ert": Ert}
+class Fmu(_Description):
+    """A co-simulation unit by the Functional Mock-up Interface, and the task that uses it."""
+
+    kind: Literal["fmu"]
+    unit: Inside | None = None
+    """The unit, a file or what was in it as a directory; without it, the app's only one."""
+
+
+Description = Block | Make | Ert | Fmu
+_MODELS: dict[str, type[_Description]] = {"block": Block, "make": Make, "ert": Ert, "fmu": Fmu}
 KINDS = tuple(_MODELS)
-_NEEDED = {"block": [TASK], "make": ["Makefile"], "ert": [TASK]}
+_NEEDED = {"block": [TASK], "make": ["Makefile"], "ert": [TASK], "fmu": [TASK]}
 _ADAPTER: TypeAdapter[Description] = TypeAdapter(Annotated[Description, Field(discriminator="kind")])
 
 

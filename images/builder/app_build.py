@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from images.builder import app, app_ert, cache, paths, progress, runtime
+from images.builder import app, app_ert, app_fmu, cache, paths, progress, runtime
 from images.builder.errors import UserError
 from images.builder.fleet import Board
 
@@ -30,6 +30,8 @@ def build(subject: app.App, board: Board, out: Path) -> None:
                     model, times_s = description.model, description.sample_times
                     app_ert.block(subject.directory, model, subject.name, times_s, source)
                     _blocks(subject, source, ("-Wall",), board.architecture, out)
+            elif isinstance(description, app.Fmu):
+                _fmu(subject, description, board.architecture, out)
             else:
                 _blocks(subject, subject.directory, runtime.WARNINGS, board.architecture, out)
         except UserError as error:
@@ -50,6 +52,15 @@ def _blocks(subject: app.App, source: Path, options: Sequence[str], architecture
             runtime.check_plugins(Path(directory))
         runtime.check_task(task, task.read_bytes(), Path(directory))
     shutil.copyfile(task, out / app.TASK)
+
+
+def _fmu(subject: app.App, description: app.Fmu, architecture: str, out: Path) -> None:
+    """The unit, and the plug-in that calls it."""
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as work:
+        unit = app_fmu.read(*app_fmu.unpacked(subject.directory, description.unit, Path(work) / "unit"))
+        app_fmu.block(unit, subject.name, Path(work) / "source")
+        _blocks(subject, Path(work) / "source", runtime.WARNINGS, architecture, out)
+        app_fmu.build(unit, subject.name, architecture, out)
 
 
 def _make(subject: app.App, description: app.Make, architecture: str, out: Path) -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from images.builder import app, boot, cache, paths, progress
+from images.builder import app, app_fmu, boot, cache, paths, progress
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Robot
 
@@ -87,8 +87,7 @@ def send(to: Connection, subject: app.App, board: Board, files: Path) -> None:
         tar.add(files, arcname=".", filter=_plain)
     size = sum(file.stat().st_size for file in files.rglob("*") if file.is_file())
     need_kib = size // 1024 + _RESERVE_KIB
-    description = subject.description
-    program = Path(description.program).name if isinstance(description, app.Make) else ""
+    program = _linked(subject)
     version = cache.digest(*sorted(files.iterdir()))[:16]
     arguments = [version, board.machine, str(need_kib), program]
     with progress.step(f"{subject.name} to {to.robot.name}, {progress.size(size)}"):
@@ -219,6 +218,13 @@ def _write(to: Connection, name: str, kind: str, text: str) -> None:
     beside = file.with_name(f".{file.name}.new")
     beside.write_text(text)
     beside.rename(file)
+
+
+def _linked(subject: app.App) -> str:
+    """What of the app is linked with libraries that the robot may lack; nothing of what is compiled here alone."""
+    if isinstance(subject.description, app.Make):
+        return Path(subject.description.program).name
+    return str(app_fmu.object_of(subject.name)) if isinstance(subject.description, app.Fmu) else ""
 
 
 def _plain(member: tarfile.TarInfo) -> tarfile.TarInfo:

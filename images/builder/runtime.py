@@ -53,6 +53,16 @@ def command(work: Path, architecture: str, argv: Sequence[str]) -> None:
 
 def compile_plugin(source: Path, architecture: str, options: Sequence[str] = WARNINGS) -> bytes:
     """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture."""
+    files = sorted(file.name for file in source.glob("*.c")) if source.is_dir() else [source.name]
+    options = ["-std=c11", *options, "-fvisibility=hidden", "-I/out/include"]
+    return compile_shared(source, files, architecture, options)
+
+
+def compile_shared(source: Path, files: Sequence[str], architecture: str, options: Sequence[str]) -> bytes:
+    """A C file, or some of a directory, as a shared object for robots of an architecture.
+
+    `files` and paths in `options` are relative to that directory.
+    """
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".plugin-") as directory:
         work = Path(directory)
         if source.is_dir():
@@ -60,10 +70,8 @@ def compile_plugin(source: Path, architecture: str, options: Sequence[str] = WAR
         else:
             (work / "source").mkdir()
             shutil.copy(source, work / "source")
-        argv = ["env", "-C", "/out/source", "gcc", "-std=c11", *options, "-O2", "-shared", "-fPIC", "-s"]
-        argv += ["-fvisibility=hidden", "-I/out/include", "-Wl,--build-id=none", "-o", "/out/plugin.so"]
-        argv += [*sorted(file.name for file in (work / "source").glob("*.c")), "-lm"]
-        command(work, architecture, argv)
+        argv = ["env", "-C", "/out/source", "gcc", "-O2", "-shared", "-fPIC", "-s", "-Wl,--build-id=none", *options]
+        command(work, architecture, [*argv, "-o", "/out/plugin.so", *files, "-lm"])
         return (work / "plugin.so").read_bytes()
 
 

@@ -28,9 +28,9 @@ def write(directory: Path, text: str) -> Path:
 
 WRONG = {
     "no YAML": ("kind: [", "while parsing a flow node"),
-    "no keys": ("block", "has no keys; at least kind: block|make|ert"),
-    "no kind": ("board: x86_64", "kind: (nothing): is missing; one of block, make, ert"),
-    "unknown kind": ("kind: blok", "kind: blok: is no kind of app; one of block, make, ert"),
+    "no keys": ("block", "has no keys; at least kind: block|make|ert|fmu"),
+    "no kind": ("board: x86_64", "kind: (nothing): is missing; one of block, make, ert, fmu"),
+    "unknown kind": ("kind: blok", "kind: blok: is no kind of app; one of block, make, ert, fmu"),
     "unknown key": ("kind: block\nprogram: x", "program: x: is no key of this kind of app; there are board, kind"),
     "no program": ("kind: make", "program: (nothing): is missing; an app of kind make needs it"),
     "program outside": ("kind: make\nprogram: ../x", "program: ../x: is not a file inside the app; such as hover"),
@@ -81,7 +81,7 @@ def test_a_new_app_is_one(tmp_path: Path, kind: str) -> None:
 
 
 def test_a_new_app_of_no_kind(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"KIND=blok: is no kind of app; one of block, make, ert"):
+    with pytest.raises(UserError, match=r"KIND=blok: is no kind of app; one of block, make, ert, fmu"):
         app_new.create("blok", "hover", tmp_path)
 
 
@@ -90,10 +90,12 @@ def test_the_new_apps_compile_without_a_warning(tmp_path: Path) -> None:
     for kind in app.KINDS:
         app_new.create(kind, f"my-{kind}", tmp_path)
     include = paths.PROJECT / "runtime" / "include"
+    unit = [f"-I{paths.PROJECT / 'images' / 'fmi'}", str(tmp_path / "my-fmu" / "unit" / "sources" / "my_fmu.c")]
     warnings = ["-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-fsyntax-only"]
     block = ["cc", "-std=c11", *warnings, f"-I{include}", str(tmp_path / "my-block" / "my_block.c")]
     subprocess.run(block, check=True)
     subprocess.run(["cc", "-std=gnu11", *warnings, str(tmp_path / "my-make" / "main.c")], check=True)
+    subprocess.run(["cc", "-std=gnu17", "-Wall", "-Werror", "-fsyntax-only", *unit], check=True)
 
 
 def test_a_programs_service(tmp_path: Path) -> None:
