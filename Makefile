@@ -91,8 +91,8 @@ test: | setup-tests ## everything: checks, a short fuzzing, images, boots in QEM
 	$(Q)$(MAKE) fuzz SECONDS=3
 	$(Q)$(FLOTILLA) image --all
 	$(Q)$(FLOTILLA) kernel --board smartcoret3
-	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit -m 'not virtual_time'; status=$$?; \
-	    $(VENV)/bin/pytest tests --ignore=tests/unit -m virtual_time -n 2 --dist loadfile && exit $$status
+	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit -m 'not parallel'; status=$$?; \
+	    $(VENV)/bin/pytest tests --ignore=tests/unit -m parallel -n 2 --dist loadfile && exit $$status
 
 bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
