@@ -75,7 +75,7 @@ requirements: | setup ## lock the Python environment anew from requirements.in
 	    --no-header --no-annotate --quiet requirements.in -o requirements.lock
 
 ##@ Quality
-.PHONY: check test bench
+.PHONY: check test test-all bench
 check: | setup-tests ## lint, types and unit tests, of the runtime too; no images, no QEMU
 	$(Q)$(VENV)/bin/ruff format --check .
 	$(Q)$(VENV)/bin/ruff check .
@@ -91,8 +91,11 @@ test: | setup-tests ## everything: checks, a short fuzzing, images, boots in QEM
 	$(Q)$(MAKE) fuzz SECONDS=3
 	$(Q)$(FLOTILLA) image --all
 	$(Q)$(FLOTILLA) kernel --board smartcoret3
-	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit -m 'not parallel'; status=$$?; \
+	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit -m 'not parallel and not long'; status=$$?; \
 	    $(VENV)/bin/pytest tests --ignore=tests/unit -m parallel -n 2 --dist loadfile && exit $$status
+
+test-all: test ## the same, and what takes minutes for one answer
+	$(Q)$(VENV)/bin/pytest tests -m long
 
 bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))

@@ -167,6 +167,7 @@ blocks:
 """
 
 
+@pytest.mark.long
 def test_a_step_that_spins_without_end_is_ended_until_it_is_given_up(bench: Bench) -> None:
     """On one processor nothing else runs meanwhile."""
     directory = bench.new("block", "spinning")

@@ -281,6 +281,7 @@ def test_what_robots_say_and_record_is_collected(guests: Guests) -> None:
     guests.sudo("robot1", "rm /var/lib/flotilla/heading/some.csv")
 
 
+@pytest.mark.long
 def test_robots_restart_and_are_healthy(guests: Guests) -> None:
     before = guests.sudo("robot4", "cat /proc/sys/kernel/random/boot_id")
     done = guests.play("-l", "robot4", playbook="reboot")
