@@ -290,6 +290,7 @@ def test_robots_restart_and_are_healthy(guests: Guests) -> None:
     assert guests.sudo("robot4", "cat /proc/sys/kernel/random/boot_id") != before
 
 
+@pytest.mark.long
 def test_a_new_card_can_get_a_new_host_key_everywhere(guests: Guests, tmp_path: Path) -> None:
     """With keys of its own, so the last test of these guests."""
     keys = tmp_path / "keys"
@@ -320,6 +321,7 @@ def altered(directory: Path, file: str, old: str, new: str) -> Path:
     return inventory
 
 
+@pytest.mark.long  # the manual's commands, which tests run, are the same ones
 def test_the_virtual_fleet_runs_in_the_background(fleet: Fleet) -> None:
     """`make fleet N=1`: found again, asked, ended; what a killed one left is no obstacle."""
     command = [sys.executable, "-m", "tests.lab.fleet"]
