@@ -3,7 +3,8 @@
 A result is a directory. It is made beside its place and renamed when complete, so that an interrupted build leaves
 nothing that could be taken for a result; what it left is removed by the next build.
 
-A build that succeeds removes old results: the newest of each kind stay, and those that it used itself.
+A build that succeeds removes old results: the newest of each kind stay, those that it used itself, and those that another
+process may be using.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import hashlib
 import os
 import re
 import shutil
+import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +24,8 @@ from images.builder import host, paths
 
 _KEPT = 4
 """Results of a kind that stay: of two boards, the present one and the one before."""
+_IN_USE_S = 3600
+"""After its last use by any process."""
 _RESULT = re.compile(r"(.+)-[0-9a-f]{16}(\.part)?")
 _used: set[Path] = set()
 
@@ -91,7 +95,8 @@ def locked(file: Path) -> Iterator[None]:
 
 
 def clean() -> None:
-    """Remove the results that this process did not use, but for the last used of each kind."""
+    """Remove the results that nobody uses, but for the last used of each kind."""
+    newest = time.time() - _IN_USE_S
     kinds: dict[str, list[Path]] = defaultdict(list)
     for path in paths.CACHE.iterdir():
         if match := _RESULT.fullmatch(path.name):
@@ -99,4 +104,5 @@ def clean() -> None:
     for results in kinds.values():
         results.sort(key=lambda path: path.stat().st_mtime, reverse=True)
         for old in set(results[_KEPT:]) - _used:
-            discard(old)
+            if old.stat().st_mtime < newest:
+                discard(old)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -38,17 +37,13 @@ def planned(plan: Plan) -> list[Scenario]:
     return [scenario for scenario in SCENARIOS if not scenario.limit_us and (plan == "standard" or scenario.quick)]
 
 
-def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING, only: Collection[str] = ()) -> Results:
-    """Measure a board's system; `results.json` is in `out` when it is done.
-
-    `control`: what is wrong with it. `only`: scenarios by name; without, all of the plan.
-    """
-    chosen = [scenario for scenario in planned(plan) if not only or scenario.name in only]
+def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING) -> Results:
+    """Measure a board's system; `results.json` is in `out` when it is done. `control`: what is wrong with it."""
     measured = subject.build(board, control.kernel)
     emulator = machine.emulator()
     out.mkdir(parents=True, exist_ok=True)
     boots: dict[tuple[str, ...], list[Scenario]] = {}
-    for scenario in chosen:
+    for scenario in planned(plan):
         boots.setdefault(scenario.without, []).append(scenario)
     documents: list[dict[str, Any]] = []
     inputs, commands = [], []
@@ -74,7 +69,7 @@ def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING, onl
         qemu=emulator.version("qemu-system-x86"),
         firmware=emulator.version("seabios"),
     )
-    found = results_of(board, plan, binding, documents, chosen, VIRTUAL)
+    found = results_of(board, plan, binding, documents, planned(plan), VIRTUAL)
     (out / "results.json").write_text(found.text())
     return found
 
