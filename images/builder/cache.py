@@ -3,8 +3,8 @@
 A result is a directory. It is made beside its place and renamed when complete, so that an interrupted build leaves
 nothing that could be taken for a result; what it left is removed by the next build.
 
-A build that succeeds removes old results: the newest of each kind stay, those that it used itself, and those that another
-process may be using.
+A build that succeeds removes old results: the newest of each kind stay, those that it used itself, and those that
+another process may be using.
 """
 
 from __future__ import annotations
