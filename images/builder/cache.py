@@ -104,5 +104,14 @@ def clean() -> None:
     for results in kinds.values():
         results.sort(key=lambda path: path.stat().st_mtime, reverse=True)
         for old in set(results[_KEPT:]) - _used:
-            if old.stat().st_mtime < newest:
-                discard(old)
+            if old.exists() and old.stat().st_mtime < newest:
+                _remove(old)
+
+
+def _remove(old: Path) -> None:
+    """A result, or what is left of one: by a name that is no result's, should this be interrupted."""
+    leaving = old.with_name(f"{old.name.removesuffix('.part')}.part")
+    if leaving != old:
+        discard(leaving)
+        old.rename(leaving)
+    discard(leaving)

@@ -130,3 +130,18 @@ def test_a_build_leaves_what_another_process_may_use(monkeypatch: pytest.MonkeyP
     with cache.exclusive():
         pass
     assert _left("root") == list(range(8))
+
+
+@pytest.mark.usefixtures("_results")
+def test_a_removal_that_was_interrupted_leaves_no_half_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen to fail when the directory keeps its name while it is emptied."""
+
+    def interrupted(directory: Path) -> None:
+        if directory.exists():
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(cache, "discard", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        cache.clean()
+    kept = [path for path in paths.CACHE.iterdir() if path.name.startswith("root")]
+    assert len([path for path in kept if path.suffix == ".part"]) == 1
