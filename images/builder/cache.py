@@ -54,19 +54,24 @@ def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
     """The directory that `make` fills, made once per `kind` and `key`."""
     final = paths.CACHE / f"{kind}-{key[:16]}"
     _used.add(final)
-    if final.exists():
-        os.utime(final)  # it was of use just now: see `clean`
-    else:
-        beside = final.with_name(final.name + ".part")
-        discard(beside)
-        beside.mkdir(parents=True)
-        try:
-            with host.explaining_a_full_disk():
-                make(beside)
-            beside.rename(final)
-        finally:
-            discard(beside)
+    if not final.exists():
+        with locked(paths.CACHE / f".{final.name}.lock"):
+            if not final.exists():  # nobody else made it meanwhile
+                _make(final, make)
+    os.utime(final)  # it was of use just now: see `clean`
     return final
+
+
+def _make(final: Path, make: Callable[[Path], None]) -> None:
+    beside = final.with_name(final.name + ".part")
+    discard(beside)
+    beside.mkdir(parents=True)
+    try:
+        with host.explaining_a_full_disk():
+            make(beside)
+        beside.rename(final)
+    finally:
+        discard(beside)
 
 
 def discard(directory: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def test_a_failed_step_leaves_nothing_that_could_be_taken_for_a_result() -> None
 
     with pytest.raises(RuntimeError):
         cache.result("kind", "0123456789abcdef", fail)
-    assert list(paths.CACHE.iterdir()) == []
+    assert list(paths.CACHE.glob("[!.]*")) == []
 
 
 def test_what_a_killed_build_left_is_removed_by_the_next() -> None:
@@ -145,3 +146,24 @@ def test_a_removal_that_was_interrupted_leaves_no_half_result(monkeypatch: pytes
         cache.clean()
     kept = [path for path in paths.CACHE.iterdir() if path.name.startswith("root")]
     assert len([path for path in kept if path.suffix == ".part"]) == 1
+
+
+def test_two_processes_make_a_result_once() -> None:
+    """Seen to fail without a lock: the second one removes what the first has begun."""
+    started, made = threading.Event(), []
+
+    def slow(out: Path) -> None:
+        (out / "begun").touch()
+        started.set()
+        other.join(0.2)  # would be done by then, if it did not wait
+        made.append((out / "begun").exists())
+
+    def same() -> None:
+        started.wait(10)
+        cache.result("kind", "0123456789abcdef", lambda out: made.append(False))
+
+    other = threading.Thread(target=same)
+    other.start()
+    cache.result("kind", "0123456789abcdef", slow)
+    other.join(10)
+    assert made == [True]
