@@ -114,9 +114,15 @@ def clean() -> None:
 
 
 def _remove(old: Path) -> None:
-    """A result, or what is left of one: by a name that is no result's, should this be interrupted."""
-    leaving = old.with_name(f"{old.name.removesuffix('.part')}.part")
-    if leaving != old:
+    """A result, or what is left of one, unless it is being made: its age says nothing while archives are unpacked."""
+    name = old.name.removesuffix(".part")
+    with (paths.CACHE / f".{name}.lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
+        leaving = old.with_name(f"{name}.part")  # which is no result's name, should this be interrupted
+        if leaving != old:
+            discard(leaving)
+            old.rename(leaving)
         discard(leaving)
-        old.rename(leaving)
-    discard(leaving)

@@ -167,3 +167,17 @@ def test_two_processes_make_a_result_once() -> None:
     cache.result("kind", "0123456789abcdef", slow)
     other.join(10)
     assert made == [True]
+
+
+@pytest.mark.usefixtures("_results")
+def test_what_is_being_made_is_left_alone() -> None:
+    """However old an archive says that it is. Seen to fail when removing takes no lock."""
+    left = []
+
+    def unpack(out: Path) -> None:
+        os.utime(out, (1, 1))
+        cache.clean()
+        left.append(out.exists())
+
+    cache.result("root", f"{99:016}", unpack)
+    assert left == [True]
