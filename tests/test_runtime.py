@@ -409,21 +409,19 @@ def test_the_worked_example_is_a_block(tasks: Tasks, tmp_path: Path) -> None:
     assert [(row["small.out"], row["large.out"]) for row in ended.rows] == [(0, -1.5)]
 
 
-def test_the_example_tasks_are_right(tasks: Tasks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_example_tasks_are_right(tasks: Tasks) -> None:
     """As robots get them. Those that talk to others are of the scenarios' fleet."""
-    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
     alone = load_fleet()
     single = alone.robots[1].model_copy(update={"control_tasks": ["heading", "heartbeat"]})
     several = virtual.fleet("udp")
     seen = set()
     for fleet, robot in [(alone, single), *((several, robot) for robot in several.robots.values())]:
-        for path, (content, _) in identity.render(fleet, robot).items():
-            if path.parent == identity.TASKS:
-                argv = tasks.argv(content.decode(), "--check")
-                done = subprocess.run(argv, capture_output=True, text=True, check=False)
-                assert (done.returncode, done.stderr) == (0, ""), path
-                seen.add(path.name)
-    assert seen == {file.name for file in paths.TASKS.glob("*.yml")}
+        for name, content in identity.control_tasks(fleet, robot).items():
+            argv = tasks.argv(content.decode(), "--check")
+            done = subprocess.run(argv, capture_output=True, text=True, check=False)
+            assert (done.returncode, done.stderr) == (0, ""), name
+            seen.add(name)
+    assert seen == {file.stem for file in paths.TASKS.glob("*.yml")}
 
 
 def test_what_threads_share_under_thread_sanitizer(flotilla_run: Path) -> None:

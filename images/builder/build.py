@@ -71,12 +71,11 @@ def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
     """Refuse what the robots themselves would refuse, all of it at once."""
     problems = []
     for robot in robots:
-        for path, (content, _) in identity.render(fleet, robot).items() if robot.control_tasks else ():
-            if path.parent == identity.TASKS:
-                try:
-                    runtime.check_task(paths.TASKS / path.name, content)
-                except UserError as error:
-                    problems.append(f"{robot.name}: {error}")
+        for name, task in identity.control_tasks(fleet, robot).items():
+            try:
+                runtime.check_task(paths.TASKS / f"{name}.yml", task)
+            except UserError as error:
+                problems.append(f"{robot.name}: {error}")
     if problems:
         raise UserError("\n".join(problems))
 

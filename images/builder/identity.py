@@ -88,16 +88,16 @@ def hosts(fleet: Fleet) -> list[Host]:
     return sorted([*fleet.robots.values(), *fleet.stations], key=lambda host: host.address)
 
 
+def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
+    """What control tasks may use."""
+    return {"fleet": fleet, "network": fleet.network, "robot": robot, "board": fleet.boards[robot.board]}
+
+
 def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
     """What the templates may use."""
     keys = host_keys(fleet)
-    board = fleet.boards[robot.board]
     first = 7400 + 250 * fleet.network.dds_domain
-    return {
-        "fleet": fleet,
-        "network": fleet.network,
-        "robot": robot,
-        "board": board,
+    return _description(fleet, robot) | {
         "hosts": hosts(fleet),
         "interface": fleet.interface(robot),
         # DDSI-RTPS 2.1, 9.6.1: ports of a domain, up to the participant index that discovery asks for.
@@ -139,11 +139,16 @@ def render(fleet: Fleet, robot: Robot) -> dict[PurePosixPath, tuple[bytes, int]]
             raise UserError(f"{paths.shown(template)}: {error}") from error
         if content.strip():
             files[PurePosixPath("/") / name.with_suffix("")] = (content, _PRIVATE.get(template.name, 0o644))
-    return files | {TASKS / f"{task}.yml": (_task(task, values), 0o644) for task in robot.control_tasks}
+    return files | {TASKS / f"{name}.yml": (task, 0o644) for name, task in control_tasks(fleet, robot).items()}
+
+
+def control_tasks(fleet: Fleet, robot: Robot) -> dict[str, bytes]:
+    """The robot's control tasks by name. Without keys: whoever only reads a description pins nothing."""
+    values = _description(fleet, robot)
+    return {name: _task(name, values) for name in robot.control_tasks}
 
 
 def _task(name: str, values: dict[str, object]) -> bytes:
-    """A control task, which may use the robot's variables like any template."""
     import jinja2
 
     file = paths.TASKS / f"{name}.yml"

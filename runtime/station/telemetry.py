@@ -66,10 +66,9 @@ def streams(fleet: Fleet) -> list[Stream]:
     stations = {str(station.address) for station in fleet.stations}
     found: dict[tuple[str, int], Stream] = {}
     for robot in fleet.robots.values():
-        files = identity.render(fleet, robot) if robot.control_tasks else {}
-        for name in robot.control_tasks:
-            task = yaml.load(files[identity.TASKS / f"{name}.yml"][0], yaml.BaseLoader)
-            for stream in of_task(robot.name, str(robot.address), name, task, stations):
+        for name, task in identity.control_tasks(fleet, robot).items():
+            parsed = yaml.load(task, yaml.BaseLoader)
+            for stream in of_task(robot.name, str(robot.address), name, parsed, stations):
                 other = found.setdefault((stream.address, stream.port), stream)
                 if other != stream:
                     both = f"{stream.topic} and {other.topic}"

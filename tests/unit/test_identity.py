@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import stat
 from pathlib import Path, PurePosixPath
 
@@ -12,6 +13,8 @@ from images.builder import identity, paths
 from images.builder.errors import UserError
 from images.builder.fleet import Fleet, Ibss, IsaResources, Robot
 from images.builder.inventory import load_fleet
+from runtime.station import telemetry
+from tests.scenarios import virtual
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +82,19 @@ def test_keys_are_made_once_pinned_and_private(fleet: Fleet) -> None:
     content, mode = identity.render(fleet, fleet.robots[3])[PurePosixPath("/etc/ssh/ssh_host_ed25519_key")]
     assert mode == 0o600
     assert content == (paths.KEYS / "robot3_ed25519").read_bytes()
+
+
+def test_reading_a_description_pins_no_keys(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen to fail when tasks were read as part of all files: a station of another fleet unpinned this one's robots."""
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+    flying = virtual.fleet("udp")
+    assert {stream.port for stream in telemetry.streams(flying)} == {5020, 5021}
+    for robot in flying.robots.values():
+        files = {f"{name}.yml": task for name, task in identity.control_tasks(flying, robot).items()}
+        assert not paths.KEYS.exists()
+        rendered = identity.render(flying, robot)
+        assert files == {path.name: task for path, (task, _) in rendered.items() if path.parent == identity.TASKS}
+        shutil.rmtree(paths.KEYS)
 
 
 def test_every_port_in_use_gets_its_name_and_baud_rate(fleet: Fleet) -> None:
