@@ -1,7 +1,9 @@
 """A control loop through the shipped image: an emulated gyro on its serial port, relays read as they are written.
 
-The plant is a robot that floats and turns without friction. It lives here, on the host, in the host's time: how late a
-step is depends on the host and is not judged, only what comes of it.
+The plant is a robot that floats and turns without friction. It lives here, on the host, and its time is the control
+task's: each step that the task makes with another sample of the gyro takes it a period further. So a host that stops
+the guest for a while stops the plant too, and how late a step is, which depends on the host, is not judged, only what
+comes of it.
 """
 
 from __future__ import annotations
@@ -10,8 +12,6 @@ import json
 import math
 import re
 import subprocess
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,12 +19,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from images.builder import boot, param, paths
+from images.builder import boot, param, paths, qemu
 from images.builder.errors import UserError
 from tests.conftest import GuestFactory, RobotGuest
 from tests.emulators.dsp3000 import Dsp3000
 from tests.emulators.ir104 import Ir104
-from tests.emulators.serial_line import SerialLine, Stream
+from tests.emulators.serial_line import SerialLine, UnixSocket
 from tests.lab.relay_ports import RelayPorts
 
 pytestmark = pytest.mark.boot
@@ -37,38 +37,40 @@ INERTIA_KG_M2 = 0.25
 class Plant:
     """Turns by the torque of the open valves; counterclockwise is positive."""
 
-    def __init__(self, board: Ir104) -> None:
-        parameters = yaml.safe_load(TASK.read_text())["blocks"]["thrusters"]["parameters"]
+    def __init__(self) -> None:
+        task = yaml.safe_load(TASK.read_text())
+        parameters = task["blocks"]["thrusters"]["parameters"]
         places, pushes = parameters["positions"], parameters["directions"]
         self._torques = [
             parameters["force"] * (places[i] * pushes[i + 1] - places[i + 1] * pushes[i]) for i in range(0, 16, 2)
         ]
-        self._board = board
+        self._period = float(task["period"].removesuffix(" ms")) / 1000
         self._at = 0.0
+        self._sampled = False
+        self.board = Ir104(after_write=self._step)
         self.heading_rad = 0.0
         self.rate_rad_s = 0.0
-        self.moved = threading.Condition()
 
-    def gyro_deg_s(self, seconds: float) -> float:
-        """The rate, clockwise, as the gyro measures it; time goes on by that."""
-        with self.moved:
-            step = min(max(seconds - self._at, 0.0), 0.1)
-            self._at = seconds
-            valves = self._board.relays[: len(self._torques)]
-            torque = sum(torque for torque, on in zip(self._torques, valves, strict=True) if on)
-            self.rate_rad_s += torque / INERTIA_KG_M2 * step
-            self.heading_rad += self.rate_rad_s * step
-            self.moved.notify_all()
+    def _step(self, offset: int) -> None:
+        """A step of the task writes each register once, and all valves are on the first."""
+        if offset or not self._sampled:
+            return
+        self._sampled = False
+        valves = self.board.relays[: len(self._torques)]
+        torque = sum(torque for torque, on in zip(self._torques, valves, strict=True) if on)
+        self._at += self._period
+        self.rate_rad_s += torque / INERTIA_KG_M2 * self._period
+        self.heading_rad += self.rate_rad_s * self._period
+
+    def gyro_deg_s(self, _: float) -> float:
+        """The rate, clockwise, as the gyro measures it."""
+        self._sampled = True
         return -math.degrees(self.rate_rad_s)
 
     def kick(self, rate_rad_s: float) -> None:
         """A disturbance: somebody bumps into the robot."""
-        with self.moved:
+        with self.board.lock:
             self.rate_rad_s += rate_rad_s
-
-    def wait(self, what: Callable[[], bool], timeout: float) -> bool:
-        with self.moved:
-            return self.moved.wait_for(what, timeout)
 
     def holds(self, heading_rad: float, seconds: float = 2.0) -> Callable[[], bool]:
         """Whether it has been near a heading, and slow, for some seconds of its own time."""
@@ -86,22 +88,8 @@ class Plant:
 class Loop:
     """The guest, its gyro, its relays and what they move."""
 
-    def __init__(self, robot: RobotGuest, gyro: SerialLine, board: Ir104, plant: Plant) -> None:
-        self.robot, self.gyro, self.board, self.plant = robot, gyro, board, plant
-
-    @property
-    def firing(self) -> bool:
-        return any(self.board.relays)
-
-    def wait_relays(self, *, on: bool, timeout: float = 20) -> bool:
-        """Wait until some relay is on, or all are off."""
-        end = time.monotonic() + timeout
-        switched = len(self.board.log)
-        while self.firing != on and time.monotonic() < end:
-            while len(self.board.log) == switched and time.monotonic() < end:
-                time.sleep(0.005)  # the board has no event; the loop is bounded
-            switched = len(self.board.log)
-        return self.firing == on
+    def __init__(self, robot: RobotGuest, gyro: SerialLine, plant: Plant) -> None:
+        self.robot, self.gyro, self.plant, self.board = robot, gyro, plant, plant.board
 
     def unit(self, name: str) -> str:
         return self.robot.shell.run(["sudo", "systemctl", "show", "-P", name, UNIT]).stdout.strip()
@@ -114,17 +102,17 @@ class Loop:
 def loop(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Loop]:
     """Robot 1 with gyro and relays, booted; its task has started with it."""
     module_guest = request.getfixturevalue("module_guest")
-    board = Ir104()
-    plant = Plant(board)
+    plant = Plant()
     with ExitStack() as stack:
-        ports = stack.enter_context(RelayPorts(board))
-        robot = module_guest(1, boot=False, qemu_options={"extra": ports.arguments})
+        ports = stack.enter_context(RelayPorts(plant.board))
+        path = tmp_path_factory.mktemp("gyro") / "socket"
+        options = {"extra": ports.arguments, "ports": {"COM5": qemu.unix_socket(path)}}
+        robot = module_guest(1, boot=False, qemu_options=options)
         robot.machine.prepare()
-        address = robot.machine.port_url("COM5").removeprefix("socket://")
-        gyro = stack.enter_context(SerialLine(Dsp3000(plant.gyro_deg_s), Stream(address)))
+        gyro = stack.enter_context(SerialLine(Dsp3000(plant.gyro_deg_s), UnixSocket(str(path))))
         robot.machine.on()
         robot.wait_booted()
-        yield Loop(robot, gyro, board, plant)
+        yield Loop(robot, gyro, plant)
 
 
 def test_the_task_starts_with_the_robot(loop: Loop) -> None:
@@ -133,25 +121,26 @@ def test_the_task_starts_with_the_robot(loop: Loop) -> None:
 
 
 def test_heading_is_held_through_a_disturbance(loop: Loop) -> None:
+    """Seen to fail, with QEMU stopped for a third of the time, while TCP kept ten seconds of samples: up to 649 °/s."""
     heading = loop.plant.heading_rad
     loop.plant.kick(math.radians(15))
-    assert loop.plant.wait(lambda: abs(loop.plant.heading_rad - heading) > math.radians(1), 20), "the kick turns it"
-    assert loop.plant.wait(loop.plant.holds(heading), 120), (
+    assert loop.board.wait(lambda: abs(loop.plant.heading_rad - heading) > math.radians(1), 20), "the kick turns it"
+    assert loop.board.wait(loop.plant.holds(heading), 120), (
         f"{math.degrees(loop.plant.heading_rad - heading):.1f}° off, {math.degrees(loop.plant.rate_rad_s):.1f} °/s"
     )
 
 
 def test_a_gyro_that_is_unplugged_closes_the_valves_until_it_is_back(loop: Loop) -> None:
     loop.plant.kick(math.radians(15))
-    assert loop.wait_relays(on=True)
+    assert loop.board.wait_relays(on=True)
     loop.gyro.unplug()
-    assert loop.wait_relays(on=False), "valves stay open without a gyro"
+    assert loop.board.wait_relays(on=False), "valves stay open without a gyro"
     switched = len(loop.board.log)
     loop.robot.shell.run(["sudo", "systemctl", "is-active", UNIT])  # a second or so in which nothing may move
     assert len(loop.board.log) == switched
     loop.gyro.replug()
-    assert loop.wait_relays(on=True), "control does not resume"
-    assert loop.plant.wait(lambda: abs(loop.plant.rate_rad_s) < math.radians(2), 120)
+    assert loop.board.wait_relays(on=True), "control does not resume"
+    assert loop.board.wait(lambda: abs(loop.plant.rate_rad_s) < math.radians(2), 120)
 
 
 def test_a_second_start_is_refused(loop: Loop) -> None:
@@ -163,10 +152,10 @@ def test_a_second_start_is_refused(loop: Loop) -> None:
 def test_a_stopped_executive_is_ended_by_the_watchdog_and_the_valves_close(loop: Loop) -> None:
     """Seen to fail without WatchdogSec=: the valves stay as they were."""
     loop.plant.kick(math.radians(15))
-    assert loop.wait_relays(on=True)
+    assert loop.board.wait_relays(on=True)
     pid = loop.main_pid()
     loop.robot.shell.run(["kill", "-STOP", str(pid)])
-    assert loop.wait_relays(on=False), "valves stay open while the executive is stopped"
+    assert loop.board.wait_relays(on=False), "valves stay open while the executive is stopped"
     wait_restarted(loop, pid)
 
 
@@ -175,7 +164,7 @@ def test_a_killed_executive_is_restarted(loop: Loop, record_property: Callable[[
     loop.robot.shell.run(["kill", "-KILL", str(pid)])
     wait_restarted(loop, pid)
     loop.plant.kick(math.radians(15))
-    assert loop.wait_relays(on=True), "the restarted task does not control"
+    assert loop.board.wait_relays(on=True), "the restarted task does not control"
     said = loop.robot.shell.run(["sudo", "journalctl", "-o", "json", "-u", UNIT, "--no-pager"]).stdout.splitlines()
     entries = [json.loads(line) for line in said]
     died = [e for e in entries if "killed" in str(e["MESSAGE"]) and "KILL" in str(e["MESSAGE"])][-1]
@@ -239,9 +228,9 @@ def test_parameters_are_the_users_of_the_task_alone(loop: Loop) -> None:
 
 def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:
     loop.plant.kick(math.radians(15))
-    assert loop.wait_relays(on=True)
+    assert loop.board.wait_relays(on=True)
     loop.robot.shell.run(["sudo", "systemctl", "stop", UNIT])
-    assert loop.wait_relays(on=False)
+    assert loop.board.wait_relays(on=False)
     assert loop.unit("Result") == "success"
     loop.robot.shell.run(["sudo", "systemctl", "start", UNIT])
 

@@ -81,13 +81,6 @@ class Bench:
     def status(self, name: str) -> dict[str, str]:
         return dict(line.split("=", 1) for line in self.do(name, "status").splitlines())
 
-    def wait_relays(self, *, on: bool) -> bool:
-        """Wait until the program's relays are on, or all are off."""
-        end = time.monotonic() + 20
-        while any(self.relays.relays) != on and time.monotonic() < end:
-            time.sleep(0.005)  # the board has no event; the loop is bounded
-        return any(self.relays.relays) == on
-
 
 @pytest.fixture(scope="module")
 def bench(module_guest: GuestFactory, fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
@@ -143,16 +136,16 @@ def test_a_program_that_ignores_sigterm_is_ended_and_its_relays_are_reset(bench:
     (directory / "app.yml").write_text(f"kind: make\nprogram: stubborn\narguments: ['{SAID}']\n")
     bench.place(directory)
     bench.do("stubborn", "start")
-    assert bench.wait_relays(on=True), "the program does not start"
+    assert bench.relays.wait_relays(on=True), "the program does not start"
     bench.do("stubborn", "stop")
     assert any(bench.relays.relays), "nothing resets them, and yet they are off"
     (directory / "safe.yml").write_text(RELAYS)
     bench.place(directory)
     for _ in range(2):
         bench.do("stubborn", "start")
-        assert bench.wait_relays(on=True), "the program does not start"
+        assert bench.relays.wait_relays(on=True), "the program does not start"
         assert bench.do("stubborn", "stop") == "", "it measures nothing"
-        assert bench.wait_relays(on=False), "relays stay on after their program was ended"
+        assert bench.relays.wait_relays(on=False), "relays stay on after their program was ended"
     assert bench.status("stubborn")["ActiveState"] == "failed"
     log = bench.guest.shell.run(["sudo", "journalctl", "-o", "cat", "-u", "flotilla-app@stubborn"]).stdout
     assert SAID in log.splitlines()
@@ -176,8 +169,8 @@ def test_a_step_that_spins_without_end_is_ended_until_it_is_given_up(bench: Benc
     (directory / "task.yml").write_text(SPINNING_TASK)
     bench.place(directory)
     bench.do("spinning", "start")
-    assert bench.wait_relays(on=True), "the app does not start"
-    assert bench.wait_relays(on=False), "relays stay on while a step spins"
+    assert bench.relays.wait_relays(on=True), "the app does not start"
+    assert bench.relays.wait_relays(on=False), "relays stay on while a step spins"
     end = time.monotonic() + 120
     while (status := bench.status("spinning"))["ActiveState"] != "failed" and time.monotonic() < end:
         pass  # asking takes a second

@@ -11,7 +11,7 @@ from pathlib import Path
 from tests.emulators.dsp3000 import Dsp3000
 from tests.emulators.micromag3 import MicroMag3
 from tests.emulators.oceanserver import OceanServer
-from tests.emulators.serial_line import Device, Faults, Pty, SerialLine, Stream
+from tests.emulators.serial_line import Device, Faults, Pty, SerialLine, UnixSocket
 from tests.emulators.urg import Urg
 
 
@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("device", choices=["dsp3000", "micromag3", "oceanserver", "urg"])
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--link", type=Path, help="path of the pseudo terminal; else one is made up")
-    where.add_argument("--connect", help="HOST:PORT or Unix socket instead, QEMU's chardev for one")
+    where.add_argument("--connect", help="path of a Unix socket instead, QEMU's chardev for one")
     parser.add_argument("--seed", type=int, default=0)
     for name in ("garbage", "half", "corrupt"):
         parser.add_argument(f"--{name}", type=float, default=0, help="share of messages")
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--old", action="store_true", help="the scanner has to be switched to SCIP 2.0")
     options = parser.parse_args()
     faults = Faults(options.garbage, options.half, options.corrupt, options.silence, options.burst, options.baud)
-    endpoint = Stream(options.connect) if options.connect else Pty(options.link)
+    endpoint = UnixSocket(options.connect) if options.connect else Pty(options.link)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
     with SerialLine(device(options), endpoint, faults=faults, seed=options.seed) as line:
         print(line.path, flush=True)

@@ -9,6 +9,7 @@ In QEMU an `isa-debugcon` at each of the first three ports hands every byte that
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -45,6 +46,10 @@ class Ir104:
     stuck: dict[int, bool] = field(default_factory=dict)
     """Relays, from 1, whose register bit stays so whatever is written."""
     log: list[Switching] = field(default_factory=list)
+    after_write: Callable[[int], None] = lambda offset: None
+    """Called with the register that was written, from 0."""
+    lock: threading.Condition = field(default_factory=threading.Condition)
+    """Held during a write."""
     _relays: int = 0
     _driven: int = 0
 
@@ -66,7 +71,19 @@ class Ir104:
         if not self.present or not _RELAYS_AT <= offset < _RELAYS_AT + 3:
             return
         shift = 8 * (offset - _RELAYS_AT)
-        self._switch(self._relays & ~(0xFF << shift) | (value & 0xFF) << shift)
+        with self.lock:
+            self._switch(self._relays & ~(0xFF << shift) | (value & 0xFF) << shift)
+            self.after_write(offset)
+            self.lock.notify_all()
+
+    def wait(self, what: Callable[[], bool], timeout: float) -> bool:
+        """Until what writes bring about is so, or for `timeout` seconds; whether it is."""
+        with self.lock:
+            return self.lock.wait_for(what, timeout)
+
+    def wait_relays(self, *, on: bool, timeout: float = 20) -> bool:
+        """Wait until some relay is on, or all are off."""
+        return self.wait(lambda: any(self.relays) == on, timeout)
 
     def read(self, port: int) -> int:
         """The byte that the processor reads at a port."""

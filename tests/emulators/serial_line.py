@@ -1,4 +1,4 @@
-"""A serial line with an emulated device at its end, over a pseudo terminal or any stream socket (QEMU's chardevs).
+"""A serial line with an emulated device at its end, over a pseudo terminal or a Unix socket (QEMU's chardevs).
 
     with SerialLine(Dsp3000(lambda seconds: 10.0), Pty()) as line:
         print(line.path)            # open this as a serial port
@@ -119,21 +119,21 @@ class Pty:
         return int(struct.unpack_from("=I", settings, 40)[0])
 
 
-class Stream:
-    """A stream socket that somebody listens on: "HOST:PORT", or the path of a Unix socket."""
+class UnixSocket:
+    """A Unix socket that somebody listens on, by its path.
 
-    def __init__(self, address: str) -> None:
-        self.path = address
+    Like a wire it keeps next to nothing for who does not listen: its sender sees what the other end has yet to read,
+    and here that is a handful of messages. TCP takes up kilobytes: ten seconds of a gyro have been seen.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
         self._socket: socket.socket | None = None
 
     def plug(self) -> int:
-        if self.path.startswith("/"):
-            self._socket = socket.socket(socket.AF_UNIX)
-            self._socket.connect(self.path)
-        else:
-            host, port = self.path.rsplit(":", 1)
-            self._socket = socket.create_connection((host, int(port)))
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 0)  # the least there is, socket(7)
+        self._socket.connect(self.path)
         self._socket.setblocking(False)
         return self._socket.fileno()
 

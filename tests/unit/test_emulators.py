@@ -20,7 +20,7 @@ from tests.emulators import dsp3000, micromag3, oceanserver, urg
 from tests.emulators.dsp3000 import Dsp3000, Mode
 from tests.emulators.micromag3 import MicroMag3
 from tests.emulators.oceanserver import Battery, OceanServer
-from tests.emulators.serial_line import Device, Faults, Pty, SerialLine, Stream, at_wrong_baud
+from tests.emulators.serial_line import Device, Faults, Pty, SerialLine, UnixSocket, at_wrong_baud
 from tests.emulators.urg import Urg
 
 TIMEOUT = 20.0
@@ -178,26 +178,45 @@ def test_line_is_garbled_when_the_rates_differ() -> None:
         robot.close()
 
 
-def test_line_over_a_socket() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        with SerialLine(Counter(), Stream(f"127.0.0.1:{port}")) as line:
-            client, _ = server.accept()
-            with client:
-                client.settimeout(TIMEOUT)
-                assert client.recv(7) == b"000001\n"
-                client.send(b"abc")
-                heard = b""
-                while b"ABC" not in heard:
-                    heard += client.recv(100)
-                line.unplug()
-                while client.recv(100):
-                    pass
-            line.replug()
-            client, _ = server.accept()
-            with client:
-                client.settimeout(TIMEOUT)
-                assert client.recv(7) == b"000001\n"
+def listener(path: Path) -> socket.socket:
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(str(path))
+    server.listen()
+    return server
+
+
+def test_line_over_a_socket(tmp_path: Path) -> None:
+    path = tmp_path / "socket"
+    with listener(path) as server, SerialLine(Counter(), UnixSocket(str(path))) as line:
+        client, _ = server.accept()
+        with client:
+            client.settimeout(TIMEOUT)
+            assert client.recv(7) == b"000001\n"
+            client.send(b"abc")
+            heard = b""
+            while b"ABC" not in heard:
+                heard += client.recv(100)
+            line.unplug()
+            while client.recv(100):
+                pass
+        line.replug()
+        client, _ = server.accept()
+        with client:
+            client.settimeout(TIMEOUT)
+            assert client.recv(7) == b"000001\n"
+
+
+def test_a_socket_keeps_little_for_who_does_not_read(tmp_path: Path) -> None:
+    """Seen to fail with the buffer that is usual: 70 messages."""
+    path = tmp_path / "socket"
+    with listener(path):
+        endpoint = UnixSocket(str(path))
+        descriptor = endpoint.plug()
+        kept = 0
+        while select.select([], [descriptor], [], 0)[1] and kept < 1000:
+            kept += bool(os.write(descriptor, dsp3000.text(0)))
+        endpoint.unplug()
+    assert 1 <= kept < 10
 
 
 # --- the gyro ---
