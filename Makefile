@@ -86,15 +86,23 @@ check: | setup-tests ## lint, types and unit tests, of the runtime too; no image
 	$(Q)$(MAKE) check-runtime
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 
-test: | setup-tests ## everything: checks, a short fuzzing, images, boots in QEMU
-	$(Q)$(MAKE) check
-	$(Q)$(MAKE) fuzz SECONDS=3
-	$(Q)$(FLOTILLA) image --all
-	$(Q)$(FLOTILLA) kernel --board smartcoret3
+test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU: everything but what test-all adds
+	$(Q)$(MAKE) -j2 test-kernel test-images
+	@# Both, whatever the first one says.
 	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit -m 'not parallel and not long'; status=$$?; \
 	    $(VENV)/bin/pytest tests --ignore=tests/unit -m parallel -n 2 --dist loadfile && exit $$status
 
-test-all: test ## the same, and what takes minutes for one answer
+# The kernel takes longest, and gets what checks and images leave of the processors.
+.PHONY: test-kernel test-images
+test-kernel: | setup-tests
+	$(Q)nice -n 19 $(FLOTILLA) kernel --board smartcoret3
+
+test-images: | setup-tests
+	$(Q)$(MAKE) check
+	$(Q)$(MAKE) fuzz SECONDS=3
+	$(Q)$(FLOTILLA) image --all
+
+test-all: test ## the same, and tests that take minutes for one answer
 	$(Q)$(VENV)/bin/pytest tests -m long
 
 bench: | setup-tests ## wall times and ratios against other builders

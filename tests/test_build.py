@@ -15,7 +15,7 @@ import pytest
 
 from images.builder import namespace, paths
 
-pytestmark = pytest.mark.image
+pytestmark = [pytest.mark.image, pytest.mark.parallel]
 
 _PATIENCE_S = 120
 

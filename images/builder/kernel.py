@@ -264,11 +264,11 @@ def _compiled(log: Path) -> int:
 
 
 def report(names: Sequence[str]) -> str:
-    """Build kernels; where the packages are and what they weigh."""
+    """Build kernels, beside which images may be built; where the packages are and what they weigh."""
     lines = []
     host.check()
     namespace.check()
-    with cache.exclusive():
+    with cache.locked(paths.CACHE / ".kernels.lock"):
         for name in names:
             package = build(name).package
             copy = paths.BUILD / "kernels" / name / package.name
