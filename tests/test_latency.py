@@ -48,7 +48,7 @@ def test_latency_is_the_accepted_one(measured: Callable[[str], Results], boards:
 def test_a_run_repeats_to_the_byte_however_the_host_schedules(
     measured: Callable[[str], Results], boards: dict[str, Board], artefacts: Path
 ) -> None:
-    """Seen to fail without QEMU's recording: one of four runs had a sample elsewhere."""
+    """Seen to fail without QEMU's recording: 11 samples were elsewhere."""
     with perturbed_host():
         again = run.measure(boards["lean"], "quick", artefacts)
     assert gate.compare(again, measured("lean")) == []

@@ -59,26 +59,18 @@ static void *original(const char *name)
 
 typedef void jump(sigjmp_buf, int);
 
-INSTEAD void siglongjmp(sigjmp_buf environment, int value)
-{
-    static jump *jump_there;
-    if (jump_there == NULL)
-        jump_there = (jump *)original("siglongjmp");
-    stop(&LEAVING);
-    jump_there(environment, value);
-    abort();
-}
-
-/* What Debian's hardened build of QEMU calls. */
-INSTEAD void __longjmp_chk(sigjmp_buf environment, int value)
-{
-    static jump *jump_there;
-    if (jump_there == NULL)
-        jump_there = (jump *)original("__longjmp_chk");
-    stop(&LEAVING);
-    jump_there(environment, value);
-    abort();
-}
+#define LEAVE(jump_away)                                                                                               \
+    INSTEAD void jump_away(sigjmp_buf environment, int value)                                                          \
+    {                                                                                                                  \
+        static jump *there;                                                                                            \
+        if (there == NULL)                                                                                             \
+            there = (jump *)original(#jump_away);                                                                      \
+        stop(&LEAVING);                                                                                                \
+        there(environment, value);                                                                                     \
+        abort();                                                                                                       \
+    }
+LEAVE(siglongjmp)
+LEAVE(__longjmp_chk) /* what Debian's hardened build of QEMU calls */
 
 INSTEAD int ppoll(struct pollfd *files, nfds_t count, const struct timespec *timeout, const sigset_t *signals)
 {

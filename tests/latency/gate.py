@@ -107,9 +107,14 @@ def _check_bounds(found: Results) -> str:
 
 def accept(found: Results, file: Path) -> None:
     """Make this run the one that later runs are compared with."""
+    keep(file, found.text())
+
+
+def keep(file: Path, text: str) -> None:
+    """Write a baseline; the one before stays until it is whole."""
     file.parent.mkdir(parents=True, exist_ok=True)
     beside = file.with_name(f".{file.name}.new")
-    beside.write_text(found.text())
+    beside.write_text(text)
     beside.rename(file)
 
 

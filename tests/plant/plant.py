@@ -140,8 +140,7 @@ def library() -> ctypes.CDLL:
     def make(out: Path) -> None:
         subprocess.run([*COMPILE, "-o", str(out / "plant.so"), str(SOURCES[0]), "-lm"], check=True)
 
-    with cache.locked(paths.CACHE / ".plant.lock"):
-        loaded = ctypes.CDLL(str(cache.result("plant", key, make) / "plant.so"))
+    loaded = ctypes.CDLL(str(cache.result("plant", key, make) / "plant.so"))
     loaded.plant_check.restype = ctypes.c_bool
     loaded.plant_check.argtypes = (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_size_t)
     loaded.plant_size.restype = ctypes.c_size_t

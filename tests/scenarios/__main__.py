@@ -5,19 +5,23 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+from collections.abc import Sequence
 
 from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
-from images.builder.fleet import Board
 from tests.scenarios import gate, report, virtual
 from tests.scenarios.flight import Flight
 from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans
+from tests.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
 
 
-def _board() -> Board:
-    return inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
+def _flown(chosen: Sequence[Plan]) -> dict[str, Flight]:
+    shutil.rmtree(OUT, ignore_errors=True)
+    board = inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
+    with progress.step(f"{len(chosen)} flights, {sum(plan.seconds for plan in chosen):g} virtual seconds"):
+        return {name: Flight(directory) for name, directory in virtual.fly(chosen, board, OUT).items()}
 
 
 def _fly(names: list[str], side_m: float) -> None:
@@ -28,21 +32,13 @@ def _fly(names: list[str], side_m: float) -> None:
         if name not in there:
             raise UserError(f"{name}: there is no such flight; there are {', '.join(there)}")
     chosen = [there[name] for name in names or there]
-    shutil.rmtree(OUT, ignore_errors=True)
-    seconds = sum(plan.seconds for plan in chosen)
-    with progress.step(f"{len(chosen)} flights, {seconds:g} virtual seconds"):
-        directories = virtual.fly(chosen, _board(), OUT)
-    page = report.write(
-        {there[name].title: Flight(directory) for name, directory in directories.items()}, paths.BUILD / "reports"
-    )
+    flown = _flown(chosen)
+    page = report.write({there[name].title: flight for name, flight in flown.items()}, paths.BUILD / "reports")
     print(f"{paths.shown(page)}; what each task said and recorded: {paths.shown(OUT)}/flights")
 
 
 def _accept() -> None:
-    tested = plans(TESTED_SIDE_M)
-    with progress.step(f"{len(tested)} flights, {sum(plan.seconds for plan in tested):g} virtual seconds"):
-        directories = virtual.fly(tested, _board(), OUT)
-    gate.accept(gate.latencies({name: Flight(directory) for name, directory in directories.items()}))
+    gate.accept(gate.latencies(_flown(plans(TESTED_SIDE_M))))
     print(f"{paths.shown(gate.BASELINE)} has the hops of these flights; commit it")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from images.builder import paths
 from images.builder.errors import UserError
-from tests.latency.gate import differences
+from tests.latency.gate import differences, keep
 from tests.latency.results import Latency
 from tests.scenarios.flight import HOPS, Flight
 
@@ -52,9 +52,7 @@ def accept(found: Latencies, file: Path = BASELINE) -> None:
         flight: ",\n".join(f'  "{hop}": {json.dumps(latency.histogram_us)}' for hop, latency in hops.items())
         for flight, hops in found.items()
     }
-    beside = file.with_name(f".{file.name}.new")
-    beside.write_text("{\n" + ",\n".join(f'"{flight}": {{\n{hops}\n}}' for flight, hops in lines.items()) + "\n}\n")
-    beside.rename(file)
+    keep(file, "{\n" + ",\n".join(f'"{flight}": {{\n{hops}\n}}' for flight, hops in lines.items()) + "\n}\n")
 
 
 def _read(file: Path) -> Latencies:
