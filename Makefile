@@ -97,9 +97,10 @@ test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU: everythin
 test-kernel: | setup-tests
 	$(Q)nice -n 19 $(FLOTILLA) kernel --board smartcoret3
 
+# Without make's job server, which ninja cannot use from here.
 test-images: | setup-tests
-	$(Q)$(MAKE) check
-	$(Q)$(MAKE) fuzz SECONDS=3
+	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory check
+	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory fuzz SECONDS=3
 	$(Q)$(FLOTILLA) image --all
 
 test-all: test ## the same, and tests that take minutes for one answer
