@@ -45,6 +45,7 @@ HARMLESS = {
     r"irqpoll boot option not supported with PREEMPT_RT": "the board asks for it; only a kernel without RT obeys",
     r"tsc: Unable to calibrate against PIT": "QEMU's timers on a busy host",
     r"tsc: Fast TSC calibration failed": "QEMU's timers on a busy host",
+    r"APIC calibration not consistent with PM-Timer": "QEMU's timers on a busy host",
     r"acpi resource window .* ignored, not CPU addressable": "QEMU's i440FX offers addresses beyond 32 bits",
     r"Model 'QEMU HARDDISK'.* applying quirks: bridgeok": "QEMU's disk has an old revision number",
     r"Kernel compiled without mitigations": "our 32-bit kernel has none; the board would switch them off",
