@@ -56,7 +56,7 @@ def board(fleet: Fleet) -> Board:
 @pytest.fixture(scope="module")
 def flown(board: Board, session_artefacts: Path) -> dict[str, Flight]:
     directories = virtual.fly(plans(TESTED_SIDE_M), board, session_artefacts / "scenarios")
-    return {name: Flight(directory) for name, directory in directories.items()}
+    return {name: Flight.read(directory) for name, directory in directories.items()}
 
 
 @pytest.fixture(scope="module")

@@ -118,17 +118,18 @@ def receive(
         if wake in ready:
             break
         for one in ready:
-            _drain(one, receiver)
+            drain(one, receiver)
         if time.monotonic() - refreshed >= REFRESH_S:
             receiver.refresh()
             refreshed = time.monotonic()
             if note:
                 note(f"{sum(count.received for count in receiver.counts.values())} messages")
     for one in sockets:  # what came before the end
-        _drain(one, receiver)
+        drain(one, receiver)
 
 
-def _drain(one: socket.socket, receiver: Receiver) -> None:
+def drain(one: socket.socket, receiver: Receiver) -> None:
+    """What has come to one of `listen`'s sockets."""
     port = one.getsockname()[1]
     for _ in range(_AT_ONCE):
         try:

@@ -9,7 +9,7 @@ Not multicast, where every member hears itself: QEMU's user-mode network answers
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import ExitStack
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -22,13 +22,22 @@ from tests.lab.emulator import Emulator
 class Segment:
     """Give each guest its `link()`; `ssh_port()` leads to it. Guests may come and go."""
 
-    def __init__(self, network: Network, robots: Iterable[IPv4Address], station: IPv4Address, directory: Path) -> None:
-        """`station`: the address under which the host appears on the segment."""
+    def __init__(
+        self, network: Network, robots: Iterable[IPv4Address], station: IPv4Address, directory: Path,
+        datagrams: Collection[tuple[IPv4Address, int]] = (),
+    ) -> None:  # fmt: skip
+        """`station`: the address under which the host appears on the segment.
+
+        `datagrams`: robots' UDP ports to which the host is to send, to each by its `udp_port()`; then what robots send
+        to the station comes to the host's loopback ports.
+        """
         directory.mkdir(parents=True, exist_ok=True)
         robots = list(robots)
-        ports = _free_udp_ports(2 * len(robots))
+        ports = _free_udp_ports(2 * len(robots) + len(datagrams))
+        self._udp = dict(zip(datagrams, ports[2 * len(robots) :], strict=True))
+        ports = ports[: 2 * len(robots)]
         self._links = {robot: qemu.Wire(*pair) for robot, *pair in zip(robots, ports[::2], ports[1::2], strict=True)}
-        user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0))
+        user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0), self._udp)
         self._emulator = Emulator(lambda qmp: self._command_line(user, qmp), directory)
         self._ports = self._emulator.forwards()
 
@@ -45,6 +54,10 @@ class Segment:
     def ssh_port(self, robot: IPv4Address) -> int:
         """The loopback port that leads to a robot's SSH."""
         return self._ports[str(robot)]
+
+    def udp_port(self, robot: IPv4Address, port: int) -> int:
+        """The loopback port that leads to a robot's UDP port; to the robot, the station sends."""
+        return self._udp[robot, port]
 
     def close(self) -> None:
         self._emulator.kill()

@@ -9,24 +9,23 @@ from collections.abc import Sequence
 
 from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
-from tests.scenarios import gate, report, virtual
+from tests.scenarios import gate, guests, report, virtual
 from tests.scenarios.flight import Flight
 from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans
 from tests.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
+GUESTS = paths.BUILD / "flights"
 
 
 def _flown(chosen: Sequence[Plan]) -> dict[str, Flight]:
     shutil.rmtree(OUT, ignore_errors=True)
     board = inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
     with progress.step(f"{len(chosen)} flights, {sum(plan.seconds for plan in chosen):g} virtual seconds"):
-        return {name: Flight(directory) for name, directory in virtual.fly(chosen, board, OUT).items()}
+        return {name: Flight.read(directory) for name, directory in virtual.fly(chosen, board, OUT).items()}
 
 
 def _fly(names: list[str], side_m: float) -> None:
-    if not 0.01 <= side_m <= 10:
-        raise UserError(f"--side {side_m:g}: is not from 0.01 to 10 m")
     there = {plan.name: plan for plan in plans(side_m)}
     for name in names:
         if name not in there:
@@ -37,18 +36,39 @@ def _fly(names: list[str], side_m: float) -> None:
     print(f"{paths.shown(page)}; what each task said and recorded: {paths.shown(OUT)}/flights")
 
 
+def _fly_guests(names: list[str], side_m: float) -> None:
+    there = {"udp", "dds"}
+    if not set(names) <= there:
+        raise UserError(f"{' '.join(names)}: guests fly {' and '.join(sorted(there))}")
+    shutil.rmtree(GUESTS, ignore_errors=True)
+    chosen = [plan for plan in plans(side_m) if plan.name in (names or ["udp"])]
+    flown = {plan.title: guests.fly(plan, GUESTS / plan.name) for plan in chosen}
+    page = report.write(flown, paths.BUILD / "reports", "flights", guests.HOW)
+    print(f"{paths.shown(page)}; consoles of the guests: {paths.shown(GUESTS)}")
+
+
 def _accept() -> None:
     gate.accept(gate.latencies(_flown(plans(TESTED_SIDE_M))))
     print(f"{paths.shown(gate.BASELINE)} has the hops of these flights; commit it")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.scenarios", description="Flights in virtual time.")
+    parser = argparse.ArgumentParser(prog="python -m tests.scenarios", description="A robot flown by four computers.")
     parser.add_argument("flights", nargs="*", help="names; without, all")
     parser.add_argument("--side", type=float, default=SIDE_M, metavar="M", help="of the square (%(default)s m)")
+    parser.add_argument("--guests", action="store_true", help="in real time, by guests of the card images")
     parser.add_argument("--accept", action="store_true", help="fly as the tests do, and accept the hops' latencies")
     arguments = parser.parse_args()
-    return exit_status(_accept if arguments.accept else lambda: _fly(arguments.flights, arguments.side))
+
+    def work() -> None:
+        if not 0.01 <= arguments.side <= 10:
+            raise UserError(f"--side {arguments.side:g}: is not from 0.01 to 10 m")
+        if arguments.accept:
+            _accept()
+        else:
+            (_fly_guests if arguments.guests else _fly)(arguments.flights, arguments.side)
+
+    return exit_status(work)
 
 
 if __name__ == "__main__":

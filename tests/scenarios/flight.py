@@ -6,7 +6,7 @@ import bisect
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -39,19 +39,37 @@ class Thrusters:
     firings: int
 
 
+@dataclass
 class Flight:
-    """`directory`: what `virtual.fly` returned."""
+    """All `time_ns` are of one clock. Not to be changed once a figure was asked for."""
 
-    def __init__(self, directory: Path) -> None:
-        self.flown = _records(directory / "plant", "flown")
-        self.steps = _records(directory / "station", "steps")
-        self.controls = _records(directory / "station", "controls")
-        self.statistics: dict[str, dict[str, Any]] = {
-            path.parent.name: json.loads(path.read_text()) for path in sorted(directory.glob("*/statistics.json"))
-        }
-        self.events_ns: list[int] = json.loads((directory / "events.json").read_text())
-        """When the events of the plan had happened."""
-        self._flown_ns: list[int] = [record["time_ns"] for record in self.flown]
+    flown: list[Record]
+    """Of the plant: pose, velocity, on-times and switches of the valves."""
+    steps: list[Record]
+    """What the valves reported of each step."""
+    controls: list[Record]
+    """What the controller reported of each tenth step."""
+    statistics: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """What tasks wrote at their end, by name; empty where they were not asked to."""
+    events_ns: list[int] = field(default_factory=list)
+    """When the events of the plan had happened."""
+    one_clock: bool = True
+    """Whether stamps of different computers may be compared, as in virtual time."""
+
+    @classmethod
+    def read(cls, directory: Path) -> Flight:
+        """What `virtual.fly` returned."""
+        return cls(
+            _records(directory / "plant", "flown"),
+            _records(directory / "station", "steps"),
+            _records(directory / "station", "controls"),
+            {path.parent.name: json.loads(path.read_text()) for path in sorted(directory.glob("*/statistics.json"))},
+            json.loads((directory / "events.json").read_text()),
+        )
+
+    @cached_property
+    def _flown_ns(self) -> list[int]:
+        return [record["time_ns"] for record in self.flown]
 
     def pose_at(self, time_ns: int) -> tuple[float, float, float]:
         """x, y in m and heading in rad, between the plant's records."""

@@ -1,4 +1,4 @@
-"""The page `scenarios.html`, and its figures as `scenarios.json`: what each flight was to do, and did."""
+"""A page of flights, and its figures as JSON: what each was to do, and did."""
 
 from __future__ import annotations
 
@@ -24,21 +24,31 @@ _SECOND_NS = 1e9
 mpl.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "flotilla", "font.size": 8, "font.family": "sans-serif"}
 
 
-def write(flights: Mapping[str, Flight], directory: Path) -> Path:
-    """`flights` by title; the page's path."""
+VIRTUAL = (
+    "It is an 802.11 ad hoc cell. All computers are namespaces of one guest in virtual time, which boots the system as "
+    "it is shipped, so a flight repeats to the byte; on its one processor of 125 million instructions a second they "
+    "delay each other as real ones would not."
+)
+
+
+def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios", how: str = VIRTUAL) -> Path:
+    """`flights` by title, `how` they were flown; the path of the page, which is called `name`."""
     directory.mkdir(parents=True, exist_ok=True)
     figures = {title: summary(flight) for title, flight in flights.items()}
-    (directory / "scenarios.json").write_text(json.dumps(figures, indent=1) + "\n")
+    (directory / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    page = directory / "scenarios.html"
+    page = directory / f"{name}.html"
     pictures = {title: _pictures(flight) for title, flight in flights.items()}
-    hops = {title: [flight.hop(index) for index in range(len(HOPS))] for title, flight in flights.items()}
+    hops = {
+        title: {name: flight.hop(index) for index, name in enumerate(HOPS)} if flight.one_clock else {}
+        for title, flight in flights.items()
+    }
     page.write_text(
         environment.get_template("report.html.j2").render(
-            figures=figures, pictures=pictures, hops=hops, hop_names=HOPS, degrees=math.degrees
+            figures=figures, pictures=pictures, hops=hops, how=how, degrees=math.degrees
         )
     )
     return page
@@ -51,9 +61,10 @@ def summary(flight: Flight) -> dict[str, object]:
         "steps": len(flight.arrived) + flight.lost(),
         "lost": flight.lost(),
         "latency_us": latency.model_dump(mode="json"),
-        "jitter_max_us": max(each["jitter"]["max_ns"] for each in flight.statistics.values()) / 1000,
-        "overruns": sum(each["overruns"] for each in flight.statistics.values()),
     }
+    if flight.statistics:
+        found["jitter_max_us"] = max(each["jitter"]["max_ns"] for each in flight.statistics.values()) / 1000
+        found["overruns"] = sum(each["overruns"] for each in flight.statistics.values())
     if flight.completed:
         error, thrusters = flight.error(), flight.thrusters()
         found |= {
@@ -122,9 +133,8 @@ def _valves(flight: Flight, axes: Axes) -> None:
 
 
 def _latency(flight: Flight, axes: Axes) -> None:
-    for index, name in enumerate(HOPS):
-        counted = flight.hop(index).histogram_us
-        axes.stairs(*_bins(counted), label=name, linewidth=0.8)
+    for index, name in enumerate(HOPS if flight.one_clock else ()):
+        axes.stairs(*_bins(flight.hop(index).histogram_us), label=name, linewidth=0.8)
     axes.stairs(*_bins(flight.latency().histogram_us), label="all four", color="black", linewidth=1.2)
     axes.axvline(10, color=_RED, linewidth=0.8)
     axes.set(title="Latency: the line is the period", xlabel="ms", ylabel="steps", xscale="log", yscale="log")

@@ -97,7 +97,7 @@ def _rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
         }
 
 
-def _changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
+def changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
     """A control task with the parameters of `changes` that are its own."""
     own = {key.split(".", 1)[1]: value for key, value in changes.items() if key.split(".")[0] == name}
     if not own:
@@ -175,7 +175,7 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
         there[configuration] = brought[robot.name]["/etc/flotilla/cyclonedds.xml"]
         for name in robot.control_tasks:
             file = f"{directory}/{name}.yml"
-            there[file] = _changed(name, brought[robot.name][_path(name)], plan.changes)
+            there[file] = changed(name, brought[robot.name][_path(name)], plan.changes)
             tasks.append({"name": name, "computer": robot.name, "file": file, "cyclonedds": configuration})
     events = [asdict(event) for event in plan.events]
     if plan.stranger:

@@ -142,6 +142,12 @@ def test_user_network_knows_the_fleet_and_lets_nothing_out() -> None:
     assert "i82559er,id=nic,mac=52:54:00:f1:00:03,romfile=,netdev=net" in values(argv, "-device")
 
 
+def test_user_network_with_datagrams_lets_guests_reach_the_station() -> None:
+    station, guest = IPv4Address("10.42.0.254"), IPv4Address("10.42.0.3")
+    arguments = qemu.user_netdev("net", NETWORK.subnet, station, {}, {(guest, 5010): 4711}).split(",")
+    assert {"restrict=off", "hostfwd=udp:127.0.0.1:4711-10.42.0.3:5010"} <= set(arguments)
+
+
 @pytest.mark.parametrize("last", [252, 253, 254])
 def test_user_network_avoids_the_guests_address(last: int) -> None:
     guest = IPv4Address(f"10.42.0.{last}")
