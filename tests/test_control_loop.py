@@ -21,6 +21,7 @@ import yaml
 
 from images.builder import boot, param, paths, qemu
 from images.builder.errors import UserError
+from runtime.station.telemetry import duration_s
 from tests.conftest import GuestFactory, RobotGuest
 from tests.emulators.dsp3000 import Dsp3000
 from tests.emulators.ir104 import Ir104
@@ -44,7 +45,7 @@ class Plant:
         self._torques = [
             parameters["force"] * (places[i] * pushes[i + 1] - places[i + 1] * pushes[i]) for i in range(0, 16, 2)
         ]
-        self._period = float(task["period"].removesuffix(" ms")) / 1000
+        self._period = duration_s(task["period"])
         self._at = 0.0
         self._sampled = False
         self.board = Ir104(after_write=self._step)

@@ -84,7 +84,7 @@ def discard(directory: Path) -> None:
 
 @contextmanager
 def exclusive() -> Iterator[None]:
-    """One build at a time in a build directory: a second one waits for the first."""
+    """One build of images or apps at a time in a build directory: a second one waits for the first."""
     with locked(paths.CACHE / ".lock"):
         yield
         clean()

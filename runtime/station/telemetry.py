@@ -100,12 +100,12 @@ def of_task(robot: str, address: str, name: str, task: dict[str, Any], stations:
             int(parameters["port"]),
             fields,
             byte_order,
-            step_s=_duration_s(task["period"]),
+            step_s=duration_s(task["period"]),
             every=int(sender.get("every", 1)),
         )
 
 
-def _duration_s(text: str) -> float:
+def duration_s(text: str) -> float:
     """Of a task file's `10 ms`, which the runtime has checked."""
     number = text.rstrip("nuµms ")
     return float(number) * _SECONDS[text[len(number) :].strip()]

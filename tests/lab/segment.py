@@ -33,10 +33,9 @@ class Segment:
         """
         directory.mkdir(parents=True, exist_ok=True)
         robots = list(robots)
-        ports = _free_udp_ports(2 * len(robots) + len(datagrams))
-        self._udp = dict(zip(datagrams, ports[2 * len(robots) :], strict=True))
-        ports = ports[: 2 * len(robots)]
-        self._links = {robot: qemu.Wire(*pair) for robot, *pair in zip(robots, ports[::2], ports[1::2], strict=True)}
+        ports = iter(_free_udp_ports(2 * len(robots) + len(datagrams)))
+        self._links = {robot: qemu.Wire(next(ports), next(ports)) for robot in robots}
+        self._udp = dict(zip(datagrams, ports, strict=True))
         user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0), self._udp)
         self._emulator = Emulator(lambda qmp: self._command_line(user, qmp), directory)
         self._ports = self._emulator.forwards()

@@ -114,7 +114,6 @@ class Laboratory:
     ) -> None:  # fmt: skip
         self.fleet, self.robot, self.machines, self.shells = described, robot, machines, shells
         self._igps = igps
-        self.events_ns: list[int] = []
         self._records: dict[str, list[Record]] = {}
         streams = [replace(stream, address=LOOPBACK) for stream in telemetry.streams(described)]
         self._receiver = receiver.Receiver(streams)
@@ -160,13 +159,8 @@ class Laboratory:
         while select.select(self._sockets, [], [], 0)[0]:  # what was said before is not of this flight
             self._hear()
         self._records = {}
-        self.events_ns = []
         self.robot.release(velocity)
         self._igps.faults = Faults()
-
-    def event(self) -> None:
-        """Something happens now."""
-        self.events_ns.append(self.robot.time_ns)
 
     @property
     def done(self) -> bool:
@@ -178,12 +172,8 @@ class Laboratory:
         with self.robot.board.lock:
             flown = list(self.robot.flown)
         return Flight(
-            flown, list(self._records.get("valves", ())), list(self._records.get("control", ())),
-            events_ns=list(self.events_ns), one_clock=False,
+            flown, list(self._records.get("valves", ())), list(self._records.get("control", ())), one_clock=False
         )  # fmt: skip
-
-    def wait_booted(self, name: str) -> None:
-        self.machines[name].console.expect(rf"{name} login: ", BOOT_SECONDS)
 
     def restart_with(self, plan: Plan) -> None:
         """Give the control tasks the plan's parameters, where they differ from what the card has."""
@@ -242,8 +232,8 @@ def laboratory(plan: Plan, out: Path) -> Iterator[Laboratory]:
         with progress.step(f"boot {len(robots)} guests"):
             for machine in machines.values():
                 machine.on()
-            for name in machines:
-                lab.wait_booted(name)
+            for name, machine in machines.items():
+                machine.console.expect(rf"{name} login: ", BOOT_SECONDS)
             for shell in shells.values():
                 shell.connect(BOOT_SECONDS)
             lab.restart_with(plan)
