@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -55,6 +58,12 @@ def decoded(file: Path, *, whole: bool = True) -> Messages:
     except EndOfFile:
         assert not whole
     return found
+
+
+def pymcap(command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """By a reader that shares nothing with the writer."""
+    argv = [Path(sys.executable).with_name("pymcap-cli"), command, *map(str, arguments)]
+    return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=PATIENCE)
 
 
 @pytest.fixture
@@ -119,6 +128,12 @@ def test_all_that_was_sent_is_recorded_and_nothing_else(fleet: Path, tmp_path: P
         recorded = steps(messages, stream.topic)
         assert recorded == list(range(begun[task], robots.sent[task]))
         assert f"{stream.topic}: {len(recorded)} received" in said
+    channels = json.loads(pymcap("info-json", out).stdout)["channels"]
+    counts = {channel["topic"]: channel["message_count"] for channel in channels}
+    assert counts == {stream.topic: robots.sent[task] - begun[task] for task, stream in robots.streams.items()}
+    # Seen to complain of an index of attachments where there are none.
+    doctor = pymcap("doctor", out)
+    assert doctor.returncode == 0, doctor.stdout
 
 
 def test_a_killed_recorder_leaves_what_it_had(fleet: Path, tmp_path: Path) -> None:
@@ -132,6 +147,7 @@ def test_a_killed_recorder_leaves_what_it_had(fleet: Path, tmp_path: Path) -> No
         recorded = steps(decoded(out, whole=False), stream.topic)
         assert len(recorded) > 20
         assert contiguous(recorded)
+    assert "BAD_TRAILING_MAGIC" in pymcap("doctor", "--format", "jsonl", out).stdout, "a doctor that finds nothing"
 
 
 def test_a_full_disk_leaves_what_was_recorded(fleet: Path, tmp_path: Path) -> None:

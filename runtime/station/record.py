@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from images.builder import paths, progress
 from images.builder.errors import UserError
@@ -34,7 +34,9 @@ class Recorder:
         self._whole_bytes = 0
         """Length of the file after the last flush."""
         self._recorded: Counter[str] = Counter()
-        self._writer = Writer(self._file, compression=CompressionType.LZ4)
+        # Of what never is in it, no index either: a reader takes an empty one for a fault.
+        indexes = IndexType.CHUNK | IndexType.MESSAGE
+        self._writer = Writer(self._file, compression=CompressionType.LZ4, index_types=indexes)
         self._channels: dict[str, tuple[int, Schema]] = {}
         with self._writing():
             self._writer.start(profile="", library="flotilla")
