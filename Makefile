@@ -86,11 +86,12 @@ check: | setup-tests ## lint, types and unit tests, of the runtime too; no image
 	$(Q)$(MAKE) check-runtime
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 
+tests = tests --ignore=tests/unit --durations=20 --durations-min=10
 test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU: everything but what test-all adds
 	$(Q)$(MAKE) -j2 test-kernel test-images
 	@# Both, whatever the first one says.
-	$(Q)$(VENV)/bin/pytest tests --ignore=tests/unit -m 'not parallel and not long'; status=$$?; \
-	    $(VENV)/bin/pytest tests --ignore=tests/unit -m parallel -n 2 --dist loadfile && exit $$status
+	$(Q)$(VENV)/bin/pytest $(tests) -m 'alone and not long'; status=$$?; \
+	    $(VENV)/bin/pytest $(tests) -m 'not alone and not long' -n 2 --dist loadfile && exit $$status
 
 # The kernel takes longest, and gets what checks and images leave of the processors.
 .PHONY: test-kernel test-images

@@ -33,7 +33,7 @@ from tests.lab.guest import Guest
 from tests.lab.segment import Segment, station_address
 from tests.lab.ssh import Ssh
 
-pytest_plugins = ["tests.lab.artefacts"]
+pytest_plugins = ["tests.lab.artefacts", "tests.lab.figures"]
 
 BOOT_SECONDS = 300
 """Until the login prompt. Some 30 s on an idle host; the limit only has to be finite, and generous to a busy one."""

@@ -28,6 +28,7 @@ from images.builder.fleet import Board, Fleet
 from images.builder.lock import read_lock
 from images.builder.tools import Tools
 from tests.conftest import GuestFactory, RobotGuest
+from tests.lab import figures
 
 pytestmark = pytest.mark.boot
 
@@ -60,19 +61,21 @@ HARMLESS = {
 
 
 class Report:
-    """Figures by board: into a file, and on the terminal at the end."""
+    """Figures by board: into a file, and, with the test that measured them, to the end of the run."""
 
     def __init__(self) -> None:
         self.figures: dict[str, dict[str, float]] = {}
+        self._new: list[str] = []
 
     def add(self, board: str, **figures: float) -> None:
-        self.figures.setdefault(board, {}).update({name: round(value, 2) for name, value in figures.items()})
+        rounded = {name: round(value, 2) for name, value in figures.items()}
+        self.figures.setdefault(board, {}).update(rounded)
+        self._new += [f"{board}: {name} {value:g}" for name, value in rounded.items()]
 
-    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        terminalreporter.section("boot")
-        for board, figures in self.figures.items():
-            shown = ", ".join(f"{name} {value:g}" for name, value in figures.items())
-            terminalreporter.write_line(f"{board}: {shown}")
+    def take(self) -> list[str]:
+        """What was added since the last call, a line each."""
+        new, self._new = self._new, []
+        return new
 
     def write(self, file: Path) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -82,11 +85,17 @@ class Report:
 
 
 @pytest.fixture(scope="module")
-def report(pytestconfig: pytest.Config) -> Iterator[Report]:
+def report() -> Iterator[Report]:
     report = Report()
-    pytestconfig.pluginmanager.register(report)
     yield report
     report.write(paths.BUILD / "reports" / "boot.json")
+
+
+@pytest.fixture(autouse=True)
+def _figures(report: Report, record_property: Callable[[str, object], None]) -> Iterator[None]:
+    yield
+    for line in report.take():
+        record_property(figures.PROPERTY, line)
 
 
 # Guests

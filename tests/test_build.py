@@ -15,7 +15,7 @@ import pytest
 
 from images.builder import namespace, paths
 
-pytestmark = [pytest.mark.image, pytest.mark.parallel]
+pytestmark = pytest.mark.image
 
 _PATIENCE_S = 120
 

@@ -23,7 +23,7 @@ from images.builder.fleet import Board, Fleet, Robot
 from images.builder.lock import read_lock
 from images.builder.tools import Tools
 
-pytestmark = [pytest.mark.image, pytest.mark.parallel]
+pytestmark = pytest.mark.image
 
 MEBIBYTE = 1 << 20
 ROOT_LIMIT = 110_000_000

@@ -15,7 +15,7 @@ from tests.latency import gate, machine, run, subject
 from tests.latency.controls import DELAY_US, Control
 from tests.latency.results import Latency, Results
 
-pytestmark = [pytest.mark.boot, pytest.mark.parallel]
+pytestmark = pytest.mark.boot
 
 BOARD = "smartcoret3"
 KERNELS = ("lean", "debian")

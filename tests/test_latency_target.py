@@ -10,7 +10,7 @@ from images.builder.fleet import Fleet
 from tests.conftest import GuestFactory
 from tests.latency import report, run, target
 
-pytestmark = pytest.mark.boot
+pytestmark = [pytest.mark.boot, pytest.mark.alone]
 
 
 def test_the_same_scenarios_on_a_robot_in_real_time(

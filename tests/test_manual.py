@@ -13,7 +13,7 @@ import pytest
 
 from images.builder import paths, verify
 
-pytestmark = pytest.mark.image
+pytestmark = [pytest.mark.image, pytest.mark.alone]
 
 MANUAL = paths.PROJECT / "docs" / "manual.md"
 ELSEWHERE = {

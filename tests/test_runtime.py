@@ -22,6 +22,8 @@ from images.builder import identity, paths
 from images.builder.inventory import load_fleet
 from tests.scenarios import virtual
 
+pytestmark = pytest.mark.alone
+
 PLUGIN = paths.PROJECT / "runtime" / "tests" / "plugin"
 HEADERS = paths.PROJECT / "runtime" / "include"
 

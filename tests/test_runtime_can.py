@@ -16,6 +16,8 @@ from tests.emulators.can_bus import UdpHub
 from tests.emulators.epos2 import Axis, Epos2, Epos2Server
 from tests.running import PATIENCE, running
 
+pytestmark = pytest.mark.alone
+
 NODE = 3
 
 DRIVE = """

@@ -16,6 +16,8 @@ import pytest
 from tests.emulators.igps import Faults, Igps
 from tests.running import PATIENCE, Task, running
 
+pytestmark = pytest.mark.alone
+
 Start = Callable[..., AbstractContextManager[Task]]
 
 

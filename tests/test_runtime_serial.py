@@ -18,6 +18,8 @@ from tests.emulators.serial_line import Faults, SerialLine
 from tests.emulators.urg import Urg
 from tests.running import PATIENCE, Row, Task, running
 
+pytestmark = pytest.mark.alone
+
 
 def watching(
     binary: Path, directory: Path, line: SerialLine, block: str, *outputs: str, **parameters: Any

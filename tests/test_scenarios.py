@@ -21,7 +21,7 @@ from tests.scenarios import gate, report, virtual
 from tests.scenarios.flight import HOPS, Flight
 from tests.scenarios.plans import TESTED_SIDE_M, plans
 
-pytestmark = [pytest.mark.boot, pytest.mark.parallel]
+pytestmark = pytest.mark.boot
 
 PERIOD_US = 10_000
 ON_TIME = {"udp": 0.999, "dds": 0.995}

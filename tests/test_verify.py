@@ -13,7 +13,7 @@ from images.builder import compare, paths
 from images.builder.build import build
 from images.builder.fleet import Fleet
 
-pytestmark = [pytest.mark.image, pytest.mark.parallel]
+pytestmark = pytest.mark.image
 ROBOT = 3
 KEPT = paths.BUILD / f"verify-robot{ROBOT}.img"
 """Where a second image stays that differs."""

@@ -18,7 +18,7 @@ from images.builder.fleet import Board, Fleet
 from tests.latency import machine, results, subject
 from tests.latency.subject import DIRECTORY
 
-pytestmark = [pytest.mark.boot, pytest.mark.parallel]
+pytestmark = pytest.mark.boot
 
 PLUGIN = paths.PROJECT / "runtime" / "tests" / "plugin" / "loopback.c"
 SECONDS = 5
