@@ -105,6 +105,7 @@ test-images: | setup-tests
 	$(Q)$(FLOTILLA) image --all
 
 test-all: test ## the same, and tests that take minutes for one answer
+	$(Q)images/install-host-packages tests/browser-packages.txt
 	$(Q)$(VENV)/bin/pytest tests -m long
 
 bench: | setup-tests ## wall times and ratios against other builders

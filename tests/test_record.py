@@ -62,7 +62,7 @@ def decoded(file: Path, *, whole: bool = True) -> Messages:
 
 def pymcap(command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     """By a reader that shares nothing with the writer."""
-    argv = [Path(sys.executable).with_name("pymcap-cli"), command, *map(str, arguments)]
+    argv = [str(Path(sys.executable).with_name("pymcap-cli")), command, *map(str, arguments)]
     return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=PATIENCE)
 
 
