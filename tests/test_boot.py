@@ -46,6 +46,8 @@ HARMLESS = {
     r"irqpoll boot option not supported with PREEMPT_RT": "the board asks for it; only a kernel without RT obeys",
     r"tsc: Unable to calibrate against PIT": "QEMU's timers on a busy host",
     r"tsc: Fast TSC calibration failed": "QEMU's timers on a busy host",
+    r"clocksource: .*'(tsc|tsc-early|refined-jiffies|acpi_pm)'": "QEMU's timers on a busy host",
+    r"TSC found unstable after boot": "QEMU's timers on a busy host",
     r"APIC calibration not consistent with PM-Timer": "QEMU's timers on a busy host",
     r"acpi resource window .* ignored, not CPU addressable": "QEMU's i440FX offers addresses beyond 32 bits",
     r"Model 'QEMU HARDDISK'.* applying quirks: bridgeok": "QEMU's disk has an old revision number",

@@ -17,7 +17,8 @@ from images.builder import namespace, paths
 
 pytestmark = pytest.mark.image
 
-_PATIENCE_S = 120
+_PATIENCE_S = 300
+"""Some 30 s on an idle host."""
 
 
 @pytest.fixture
@@ -71,18 +72,20 @@ def running(build: Path) -> Iterator[subprocess.Popen[str]]:
     timer = select.poll()  # waits for the process's end, and wakes now and then to look at the log
     descriptor = os.pidfd_open(process.pid)
     timer.register(descriptor, select.POLLIN)
-    for _ in range(_PATIENCE_S * 10):
-        if log.exists() and "Configuring" in log.read_text():
-            break
-        assert not timer.poll(100), process.communicate()[1]
-    else:
-        pytest.fail("the build never reached debootstrap's second stage")
-    yield process
-    process.kill()
-    process.wait()
-    if process.stderr:
-        process.stderr.close()
-    os.close(descriptor)
+    try:
+        for _ in range(_PATIENCE_S * 10):
+            if log.exists() and "Configuring" in log.read_text():
+                break
+            assert not timer.poll(100), process.communicate()[1]
+        else:
+            pytest.fail("the build never reached debootstrap's second stage")
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        if process.stderr:
+            process.stderr.close()
+        os.close(descriptor)
 
 
 def _gone(pids: set[int]) -> bool:
