@@ -81,7 +81,7 @@ def of_task(robot: str, address: str, name: str, task: dict[str, Any], stations:
     blocks: dict[str, Any] = task["blocks"]
     for sender in blocks.values():
         parameters = sender.get("parameters", {})
-        if sender["type"] != "udp-send" or parameters["address"] not in stations:
+        if sender["type"] != "udp-send" or stations.isdisjoint(_listed(parameters["address"])):
             continue
         packer = sender["in"]["data"].partition(".")[0]
         if blocks.get(packer, {}).get("type") != "pack":
@@ -103,6 +103,11 @@ def of_task(robot: str, address: str, name: str, task: dict[str, Any], stations:
             step_s=duration_s(task["period"]),
             every=int(sender.get("every", 1)),
         )
+
+
+def _listed(value: str | list[str]) -> list[str]:
+    """A parameter that may be a list or one value."""
+    return value if isinstance(value, list) else [value]
 
 
 def duration_s(text: str) -> float:

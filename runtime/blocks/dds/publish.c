@@ -10,6 +10,11 @@
 
 enum { WAITING = 4 };
 
+struct dds_publish {
+    struct dds_settings common;
+    int64_t robot;
+};
+
 struct state {
     struct dds_settings settings;
     struct fl_block *block;
@@ -22,7 +27,15 @@ struct state {
     _Atomic uint32_t peers, written;
 };
 
-static const struct fl_parameter parameters[] = {DDS_PARAMETERS(struct dds_settings)};
+static const struct fl_parameter parameters[] = {
+    DDS_PARAMETERS(struct dds_settings),
+    FL_PARAMETER(struct dds_publish, robot, .min = 0, .max = 65535, .summary = "number of the robot that sends"),
+};
+
+enum { WITHHOLD, DATA };
+static const struct fl_port inputs[] = {
+    {.name = "withhold", .type = FL_BOOLEAN, .width = 1, .flags = FL_OPTIONAL, .summary = "1: nothing is published"},
+};
 
 enum { PEERS, WRITTEN };
 static const struct fl_port outputs[] = {
@@ -84,7 +97,7 @@ static int start(struct fl_block *block)
     state->storage = fl_allocate(block, dds_storage_bytes());
     if (!memory || !state->storage)
         return FL_FAILED;
-    state->settings = *(const struct dds_settings *)block->parameters;
+    state->settings = ((const struct dds_publish *)block->parameters)->common;
     state->block = block;
     fl_ring_initialize(&state->samples, memory, sizeof(struct dds_sample), WAITING);
     if (socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, state->wake) < 0)
@@ -95,14 +108,17 @@ static int start(struct fl_block *block)
 
 static int step(struct fl_block *block)
 {
+    const struct dds_publish *set = block->parameters;
     struct state *state = block->state;
-    struct dds_sample sample = {.robot = (uint16_t)state->settings.robot, .number = state->number++};
-    struct timespec real;
-    clock_gettime(CLOCK_REALTIME, &real);
-    sample.stamp_ns = real.tv_sec * INT64_C(1000000000) + real.tv_nsec;
-    memcpy(sample.values, block->in[0], dds_value_bytes(&state->settings));
-    if (fl_ring_put(&state->samples, &sample))
-        send(state->wake[0], "", 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+    if (!FL_IN(block, WITHHOLD, uint8_t)) {
+        struct dds_sample sample = {.robot = (uint16_t)set->robot, .number = state->number++};
+        struct timespec real;
+        clock_gettime(CLOCK_REALTIME, &real);
+        sample.stamp_ns = real.tv_sec * INT64_C(1000000000) + real.tv_nsec;
+        memcpy(sample.values, block->in[DATA], dds_value_bytes(&state->settings));
+        if (fl_ring_put(&state->samples, &sample))
+            send(state->wake[0], "", 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+    }
     FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
     FL_OUT(block, WRITTEN, uint32_t) = atomic_load(&state->written);
     return FL_OK;
@@ -122,9 +138,10 @@ FL_BLOCK(dds_publish) = {
     .name = "dds-publish",
     .summary = "publishes its input as a sample of a DDS topic, in each step",
     .source = "OMG DDS 1.4; DDSI-RTPS 2.5; Eclipse Cyclone DDS 0.10",
+    FL_TABLE(input, inputs),
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),
-    .parameters_size = sizeof(struct dds_settings),
+    .parameters_size = sizeof(struct dds_publish),
     .state_size = sizeof(struct state),
     .configure = configure,
     .start = start,

@@ -2,7 +2,9 @@
 #include "topic.h"
 
 #include <errno.h>
+#include <flotilla/failover.h>
 #include <flotilla/sensor.h>
+#include <math.h>
 #include <stdatomic.h>
 #include <string.h>
 #include <sys/eventfd.h>
@@ -12,11 +14,13 @@ enum { WAITING = 16, BATCH = 8 };
 
 struct dds_subscribe {
     struct dds_settings common;
-    double timeout;
+    struct fl_reals robot;
+    double failover, timeout;
 };
 
 struct state {
     struct dds_settings settings;
+    struct fl_failover failover; /* DDS's thread's */
     struct fl_block *block;
     struct fl_driver *driver;
     struct fl_ring samples;
@@ -30,10 +34,13 @@ struct state {
 
 static const struct fl_parameter parameters[] = {
     DDS_PARAMETERS(struct dds_settings),
+    FL_PARAMETER(struct dds_subscribe, robot, .min = 0, .max = 65535,
+                 .summary = "number of the robot that sends, or several, the first in rank first"),
+    FL_FAILOVER(struct dds_subscribe),
     FL_SENSOR_TIMEOUT(struct dds_subscribe, "0.1"),
 };
 
-enum { VALUES, NUMBER, STAMP, PEERS, FLAG };
+enum { VALUES, NUMBER, STAMP, PEERS, SENDER, FLAG };
 
 static void matched(dds_entity_t reader, const dds_subscription_matched_status_t status, void *context)
 {
@@ -50,19 +57,32 @@ static void missed(dds_entity_t reader, const dds_requested_deadline_missed_stat
     atomic_store(&state->late, true);
 }
 
-/* Called by DDS, one call at a time for a reader. A topic carries the samples of all robots; one is wanted. */
+/* The place of the sample's robot among those that are listened to, or their number. */
+static size_t rank_of(const struct fl_reals *robots, const struct dds_sample *sample)
+{
+    size_t rank = 0;
+    while (rank < robots->count && lround(robots->value[rank]) != sample->robot)
+        rank++;
+    return rank;
+}
+
+/* Called by DDS, one call at a time for a reader. A topic carries the samples of all robots; one's are wanted. */
 static void arrived(dds_entity_t reader, void *context)
 {
     struct state *state = context;
+    const struct dds_subscribe *set = state->block->parameters;
     void *samples[BATCH] = {NULL};
     dds_sample_info_t infos[BATCH];
     dds_return_t count;
     int64_t now_ns = fl_now_ns();
     while ((count = dds_take(reader, samples, infos, BATCH, BATCH)) > 0) {
         for (dds_return_t i = 0; i < count; i++) {
-            if (!infos[i].valid_data || !dds_decode(&state->settings, samples[i], &state->arriving) ||
-                state->arriving.robot != state->settings.robot)
+            if (!infos[i].valid_data || !dds_decode(&state->settings, samples[i], &state->arriving))
                 continue;
+            size_t rank = rank_of(&set->robot, &state->arriving);
+            if (rank == set->robot.count || !fl_failover_takes(&state->failover, rank, now_ns, set->failover))
+                continue;
+            state->arriving.sender = (uint32_t)rank;
             state->arriving.arrived_ns = now_ns;
             atomic_store(&state->late, false);
             fl_ring_put(&state->samples, &state->arriving);
@@ -97,13 +117,20 @@ static void run(struct fl_driver *driver, void *context)
 
 static int configure(struct fl_block *block)
 {
+    const struct dds_subscribe *set = block->parameters;
     const struct fl_port outputs[] = {
-        dds_port(block->parameters),
+        dds_port(&set->common),
         {.name = "number", .type = FL_UINT32, .width = 1, .summary = "the sender's count of its samples"},
         {.name = "stamp", .type = FL_INT64, .width = 1, .unit = "ns", .summary = "the sender's fleet time"},
         {.name = "peers", .type = FL_UINT32, .width = 1, .summary = "publishers of the topic that are known now"},
+        {.name = "sender", .type = FL_UINT32, .width = 1, .summary = "who is listened to: 0 is the first of `robot`"},
         FL_SENSOR_OUTPUTS,
     };
+    if (set->robot.count < 1 || set->robot.count > FL_SENDERS)
+        return fl_fail(block, "parameter robot: give 1 to %d numbers", FL_SENDERS);
+    for (size_t i = 0; i < set->robot.count; i++)
+        if (set->robot.value[i] != floor(set->robot.value[i]))
+            return fl_fail(block, "parameter robot: %g is no whole number", set->robot.value[i]);
     for (size_t i = 0; i < sizeof outputs / sizeof outputs[0]; i++)
         if (fl_add_output(block, outputs[i]) != FL_OK)
             return FL_FAILED;
@@ -119,6 +146,7 @@ static int start(struct fl_block *block)
     state->settings = ((const struct dds_subscribe *)block->parameters)->common;
     state->block = block;
     fl_sensor_begin(&state->sensor);
+    fl_failover_begin(&state->failover, fl_now_ns());
     fl_ring_initialize(&state->samples, memory, sizeof(struct dds_sample), WAITING);
     state->arrived_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     if (state->arrived_fd < 0)
@@ -150,6 +178,7 @@ static int step(struct fl_block *block)
         memcpy(block->out[VALUES], state->taken.values, dds_value_bytes(&state->settings));
         FL_OUT(block, NUMBER, uint32_t) = state->taken.number;
         FL_OUT(block, STAMP, int64_t) = state->taken.stamp_ns;
+        FL_OUT(block, SENDER, uint32_t) = state->taken.sender;
         fl_sensor_update(&state->sensor, state->taken.arrived_ns, state->sensor.sequence + 1);
     }
     FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
@@ -168,7 +197,7 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(dds_subscribe) = {
     .abi = FL_ABI,
     .name = "dds-subscribe",
-    .summary = "the newest sample that a robot published on a DDS topic",
+    .summary = "the newest sample that a robot published on a DDS topic, or one that stands by for it",
     .source = "OMG DDS 1.4; DDSI-RTPS 2.5; Eclipse Cyclone DDS 0.10",
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct dds_subscribe),

@@ -15,6 +15,7 @@ enum { DDS_VALUES = 1024 };
 struct dds_sample {
     uint16_t robot;
     uint32_t number;
+    uint32_t sender;    /* its rank, where it arrives */
     int64_t stamp_ns;   /* the sender's CLOCK_REALTIME */
     int64_t arrived_ns; /* CLOCK_MONOTONIC */
     _Alignas(8) uint8_t values[DDS_VALUES];
@@ -23,7 +24,7 @@ struct dds_sample {
 struct dds_settings {
     int type;
     const char *topic;
-    int64_t domain, bytes, robot;
+    int64_t domain, bytes;
     int reliability;
     double deadline;
 };
@@ -36,7 +37,6 @@ struct dds_settings {
                      .summary = "DDS domain: tasks of different domains do not see each other"),                       \
         FL_PARAMETER(block_type, bytes, .fallback = "64", .min = 1, .max = DDS_VALUES, .unit = "B",                    \
                      .summary = "length of a sample of type `bytes`"),                                                 \
-        FL_PARAMETER(block_type, robot, .min = 0, .max = 65535, .summary = "number of the robot that sends"),          \
         FL_PARAMETER(block_type, reliability, .fallback = "best-effort", .choices = "best-effort|reliable",            \
                      .summary = "whether lost samples are sent again, as long as they are the newest"),                \
         FL_PARAMETER(block_type, deadline, .fallback = "0", .min = 0, .max = 1e6, .unit = "s",                         \

@@ -25,7 +25,7 @@ static const struct fl_port outputs[] = {
     UDP_RECEIVER_OUTPUTS,
 };
 
-enum { POSITION, FLAG, AGE, SEQUENCE, DROPPED, REFUSED };
+enum { POSITION, FLAG, AGE, SEQUENCE, DROPPED };
 
 struct state {
     struct udp_receiver receiver;
@@ -43,7 +43,8 @@ static int start(struct fl_block *block)
     const struct igps *igps = block->parameters;
     struct state *state = block->state;
     fl_sensor_begin(&state->sensor);
-    return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from);
+    return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from,
+                             igps->failover);
 }
 
 static int step(struct fl_block *block)
@@ -66,8 +67,7 @@ static int step(struct fl_block *block)
         fl_sensor_update(&state->sensor, arrived_ns, state->sensor.sequence + 1);
     }
     fl_sensor_outputs(&state->sensor, block, FLAG, true, igps->timeout);
-    FL_OUT(block, DROPPED, uint32_t) = state->receiver.dropped;
-    FL_OUT(block, REFUSED, uint32_t) = state->receiver.refused;
+    udp_receiver_outputs(&state->receiver, block, DROPPED);
     return FL_OK;
 }
 

@@ -22,6 +22,19 @@ int udp_read_address(struct fl_block *block, const char *parameter, const char *
     return FL_OK;
 }
 
+int udp_read_addresses(struct fl_block *block, const char *parameter, struct fl_texts texts, struct in_addr *addresses)
+{
+    if (texts.count < 1 || texts.count > FL_SENDERS)
+        return fl_fail(block, "parameter %s: give 1 to %d addresses", parameter, FL_SENDERS);
+    for (size_t i = 0; i < texts.count; i++) {
+        if (udp_read_address(block, parameter, texts.value[i], &addresses[i]) != FL_OK)
+            return FL_FAILED;
+        if (addresses[i].s_addr == INADDR_ANY && texts.count > 1)
+            return fl_fail(block, "parameter %s: 0.0.0.0 is anybody, and cannot be one of several", parameter);
+    }
+    return FL_OK;
+}
+
 static int fail_to_bind(struct fl_block *block, const char *local_address, int64_t port)
 {
     if (errno == EADDRINUSE)
@@ -57,20 +70,22 @@ int udp_open(struct fl_block *block, const char *local_address, int64_t port, co
     return -1;
 }
 
-int udp_receiver_check(struct fl_block *block, const char *local_address, const char *from)
+int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_texts from)
 {
-    struct in_addr address;
-    if (udp_read_address(block, "local_address", local_address, &address) != FL_OK)
+    struct in_addr addresses[FL_SENDERS];
+    if (udp_read_address(block, "local_address", local_address, &addresses[0]) != FL_OK)
         return FL_FAILED;
-    return udp_read_address(block, "from", from, &address);
+    return udp_read_addresses(block, "from", from, addresses);
 }
 
 int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
-                      const char *interface, const char *from)
+                      const char *interface, struct fl_texts from, double failover)
 {
     static const int on = 1;
-    *receiver = (struct udp_receiver){.emptied_ns = fl_now_ns()};
-    if (udp_read_address(block, "from", from, &receiver->from) != FL_OK)
+    *receiver =
+        (struct udp_receiver){.emptied_ns = fl_now_ns(), .from_count = from.count, .failover_timeout = failover};
+    fl_failover_begin(&receiver->failover, receiver->emptied_ns);
+    if (udp_read_addresses(block, "from", from, receiver->from) != FL_OK)
         return FL_FAILED;
     receiver->fd = udp_open(block, local_address, port, interface);
     if (receiver->fd < 0)
@@ -115,9 +130,14 @@ static int64_t read_control(struct udp_receiver *receiver, struct msghdr *messag
     return stamp_ns;
 }
 
-static bool from_right(const struct udp_receiver *receiver, const struct sockaddr_in *sender)
+/* The sender's place in `from`, or its length. */
+static size_t rank_of(const struct udp_receiver *receiver, const struct sockaddr_in *sender)
 {
-    return receiver->from.s_addr == INADDR_ANY || receiver->from.s_addr == sender->sin_addr.s_addr;
+    size_t rank = 0;
+    while (rank < receiver->from_count && receiver->from[rank].s_addr != INADDR_ANY &&
+           receiver->from[rank].s_addr != sender->sin_addr.s_addr)
+        rank++;
+    return rank;
 }
 
 bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int64_t *arrived_ns, int *budget)
@@ -141,16 +161,29 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int6
             return false;
         }
         int64_t stamp_ns = read_control(receiver, &message);
-        if ((size_t)got == length && from_right(receiver, &sender)) {
-            /* In this order: what delays between the two lets the datagram look older, never younger. */
-            int64_t now_ns = fl_now_ns();
-            *arrived_ns = udp_arrival_ns(stamp_ns, wall_ns(), now_ns, receiver->emptied_ns);
+        size_t rank = rank_of(receiver, &sender);
+        if ((size_t)got != length || rank == receiver->from_count) {
+            receiver->refused++;
+            continue;
+        }
+        /* In this order: what delays between the two lets the datagram look older, never younger. */
+        int64_t now_ns = fl_now_ns();
+        int64_t came_ns = udp_arrival_ns(stamp_ns, wall_ns(), now_ns, receiver->emptied_ns);
+        if (fl_failover_takes(&receiver->failover, rank, came_ns, receiver->failover_timeout)) {
+            receiver->sender = (uint32_t)rank;
+            *arrived_ns = came_ns;
             return true;
         }
-        receiver->refused++;
     }
     *budget = 0;
     return false;
+}
+
+void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *block, uint32_t first)
+{
+    FL_OUT(block, first, uint32_t) = receiver->dropped;
+    FL_OUT(block, first + 1, uint32_t) = receiver->refused;
+    FL_OUT(block, first + 2, uint32_t) = receiver->sender;
 }
 
 void udp_receiver_close(struct udp_receiver *receiver)

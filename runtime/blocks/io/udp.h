@@ -2,7 +2,7 @@
 #ifndef FLOTILLA_IO_UDP_H
 #define FLOTILLA_IO_UDP_H
 
-#include <flotilla/block.h>
+#include <flotilla/failover.h>
 #include <netinet/in.h>
 
 enum {
@@ -27,16 +27,22 @@ enum {
 #define UDP_RECEIVER_MEMBERS                                                                                           \
     int64_t port;                                                                                                      \
     UDP_LOCAL_MEMBERS;                                                                                                 \
-    const char *from
+    struct fl_texts from;                                                                                              \
+    double failover
 
 #define UDP_RECEIVER_PARAMETERS(type)                                                                                  \
     FL_PARAMETER(type, port, .min = 1, .max = 65535, .summary = "UDP port of this computer"),                          \
         UDP_LOCAL_PARAMETERS(type),                                                                                    \
         FL_PARAMETER(type, from, .fallback = "0.0.0.0",                                                                \
-                     .summary = "IPv4 address that is listened to alone; 0.0.0.0: all are")
+                     .summary = "IPv4 address that is listened to alone, or several, the first in rank first; "        \
+                                "0.0.0.0: all are"),                                                                   \
+        FL_FAILOVER(type)
 
 /* Read a parameter's IPv4 address, of one computer or of a broadcast, for `configure`. FL_OK or FL_FAILED. */
 int udp_read_address(struct fl_block *block, const char *parameter, const char *text, struct in_addr *address);
+
+/* The same for a list of 1 to FL_SENDERS addresses, in which 0.0.0.0 stands alone. */
+int udp_read_addresses(struct fl_block *block, const char *parameter, struct fl_texts texts, struct in_addr *addresses);
 
 /* A socket bound to this computer's address, a port (0: any free one) and an interface: descriptor, or -1 after
  * fl_fail(). */
@@ -47,21 +53,29 @@ int udp_open(struct fl_block *block, const char *local_address, int64_t port, co
 struct udp_receiver {
     bool open;
     int fd;
-    struct in_addr from;
+    struct in_addr from[FL_SENDERS];
+    size_t from_count;
+    uint32_t sender; /* of the datagram that was taken last: its place in `from` */
+    struct fl_failover failover;
+    double failover_timeout;
     int64_t emptied_ns; /* when last nothing waited: what comes later has arrived later */
     uint32_t dropped;   /* by the kernel, for want of room */
-    uint32_t refused;   /* of another length, or not from `from` */
+    uint32_t refused;   /* of another length, or from none of `from` */
 };
 
 #define UDP_RECEIVER_OUTPUTS                                                                                           \
     {.name = "dropped", .type = FL_UINT32, .width = 1, .summary = "datagrams that the kernel had no room for"},        \
-        {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "datagrams of another length or sender"}
+        {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "datagrams of another length or sender"},        \
+        {.name = "sender", .type = FL_UINT32, .width = 1, .summary = "who is listened to: 0 is the first of `from`"}
 
 /* Whether the addresses among the parameters can be read, for `configure`. */
-int udp_receiver_check(struct fl_block *block, const char *local_address, const char *from);
+int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_texts from);
 
 int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
-                      const char *interface, const char *from);
+                      const char *interface, struct fl_texts from, double failover);
+
+/* Write the outputs UDP_RECEIVER_OUTPUTS, of which `dropped` is number `first`. */
+void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *block, uint32_t first);
 
 /* When a datagram arrived, on CLOCK_MONOTONIC. The kernel stamps by the wall clock, which may be set at any time: what
  * comes out of that wrong is kept between what is known for sure, after the queue was last empty and before now. */

@@ -27,7 +27,7 @@ static const struct fl_port outputs[] = {
     UDP_RECEIVER_OUTPUTS,
 };
 
-enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, DATA };
+enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, SENDER, DATA };
 
 struct state {
     struct udp_receiver receiver;
@@ -55,7 +55,8 @@ static int start(struct fl_block *block)
     state->scratch = fl_allocate(block, (size_t)udp->length);
     if (!state->scratch)
         return FL_FAILED;
-    return udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from);
+    return udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from,
+                             udp->failover);
 }
 
 /* What is refused is no reason for a step. */
@@ -86,8 +87,7 @@ static int step(struct fl_block *block)
             break;
     }
     fl_sensor_outputs(&state->sensor, block, FLAG, true, udp->timeout);
-    FL_OUT(block, DROPPED, uint32_t) = state->receiver.dropped;
-    FL_OUT(block, REFUSED, uint32_t) = state->receiver.refused;
+    udp_receiver_outputs(&state->receiver, block, DROPPED);
     return FL_OK;
 }
 

@@ -7,7 +7,7 @@
 #include <unistd.h>
 
 struct udp_send {
-    const char *address;
+    struct fl_texts address;
     int64_t port;
     UDP_LOCAL_MEMBERS;
     int64_t length;
@@ -16,7 +16,7 @@ struct udp_send {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct udp_send, address, .summary = "IPv4 address to send to"),
+    FL_PARAMETER(struct udp_send, address, .summary = "IPv4 address to send to, or several"),
     FL_PARAMETER(struct udp_send, port, .min = 1, .max = 65535, .summary = "UDP port to send to"),
     UDP_LOCAL_PARAMETERS(struct udp_send),
     FL_PARAMETER(struct udp_send, length, .min = 1, .max = UDP_LONGEST, .unit = "B",
@@ -27,6 +27,10 @@ static const struct fl_parameter parameters[] = {
                  .summary = "class of service (RFC 2474); 46 is voice to 802.11, which goes first"),
 };
 
+static const struct fl_port inputs[] = {
+    {.name = "withhold", .type = FL_BOOLEAN, .width = 1, .flags = FL_OPTIONAL, .summary = "1: nothing is sent"},
+};
+
 static const struct fl_port outputs[] = {
     {.name = "sent", .type = FL_UINT32, .width = 1, .summary = "datagrams handed to the network so far"},
     {.name = "failed",
@@ -35,27 +39,29 @@ static const struct fl_port outputs[] = {
      .summary = "datagrams the network did not take: no route, or full"},
 };
 
-enum { DATA };
+enum { WITHHOLD, DATA };
 enum { SENT, FAILED };
 
 struct state {
     bool open;
     int fd;
-    struct sockaddr_in to;
+    struct sockaddr_in to[FL_SENDERS];
 };
 
 static int configure(struct fl_block *block)
 {
     const struct udp_send *udp = block->parameters;
-    struct in_addr to, local;
-    if (udp_read_address(block, "address", udp->address, &to) != FL_OK ||
+    struct in_addr to[FL_SENDERS], local;
+    if (udp_read_addresses(block, "address", udp->address, to) != FL_OK ||
         udp_read_address(block, "local_address", udp->local_address, &local) != FL_OK)
         return FL_FAILED;
-    if (to.s_addr == INADDR_ANY)
-        return fl_fail(block, "parameter address: 0.0.0.0 is nowhere to send to");
-    if (to.s_addr == INADDR_BROADCAST && !udp->broadcast)
-        return fl_fail(block, "parameter address: %s is a broadcast address; allow it by broadcast: true",
-                       udp->address);
+    for (size_t i = 0; i < udp->address.count; i++) {
+        if (to[i].s_addr == INADDR_ANY)
+            return fl_fail(block, "parameter address: 0.0.0.0 is nowhere to send to");
+        if (to[i].s_addr == INADDR_BROADCAST && !udp->broadcast)
+            return fl_fail(block, "parameter address: %s is a broadcast address; allow it by broadcast: true",
+                           udp->address.value[i]);
+    }
     return fl_add_input(block, (struct fl_port){.name = "data",
                                                 .type = FL_UINT8,
                                                 .width = (uint32_t)udp->length,
@@ -64,12 +70,12 @@ static int configure(struct fl_block *block)
 
 /* Which addresses are broadcasts only the routes of this computer tell: connecting a socket of its own asks for it and
  * sends nothing. Without a route there may be one later: that is no failure. */
-static int refuse_broadcast(struct fl_block *block, const struct state *state, const char *address)
+static int refuse_broadcast(struct fl_block *block, const struct sockaddr_in *to, const char *address)
 {
     int fd = socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
     if (fd < 0)
         return fl_fail(block, "cannot open a UDP socket: %s", strerror(errno));
-    bool refused = connect(fd, (const struct sockaddr *)&state->to, sizeof state->to) < 0 && errno == EACCES;
+    bool refused = connect(fd, (const struct sockaddr *)to, sizeof *to) < 0 && errno == EACCES;
     close(fd);
     if (refused)
         return fl_fail(block, "%s is the broadcast address of a network; allow it by broadcast: true", address);
@@ -81,11 +87,15 @@ static int start(struct fl_block *block)
     const struct udp_send *udp = block->parameters;
     struct state *state = block->state;
     int on = udp->broadcast, service = (int)udp->dscp << 2; /* above the two bits of congestion notification */
-    state->to = (struct sockaddr_in){.sin_family = AF_INET, .sin_port = htons((uint16_t)udp->port)};
-    if (udp_read_address(block, "address", udp->address, &state->to.sin_addr) != FL_OK)
+    struct in_addr to[FL_SENDERS];
+    if (udp_read_addresses(block, "address", udp->address, to) != FL_OK)
         return FL_FAILED;
-    if (!udp->broadcast && refuse_broadcast(block, state, udp->address) != FL_OK)
-        return FL_FAILED;
+    for (size_t i = 0; i < udp->address.count; i++) {
+        state->to[i] =
+            (struct sockaddr_in){.sin_family = AF_INET, .sin_port = htons((uint16_t)udp->port), .sin_addr = to[i]};
+        if (!udp->broadcast && refuse_broadcast(block, &state->to[i], udp->address.value[i]) != FL_OK)
+            return FL_FAILED;
+    }
     state->fd = udp_open(block, udp->local_address, 0, udp->interface);
     if (state->fd < 0)
         return FL_FAILED;
@@ -100,12 +110,16 @@ static int step(struct fl_block *block)
 {
     const struct udp_send *udp = block->parameters;
     const struct state *state = block->state;
-    ssize_t sent = sendto(state->fd, block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
-                          (const struct sockaddr *)&state->to, sizeof state->to);
-    if (sent == udp->length)
-        FL_OUT(block, SENT, uint32_t)++;
-    else
-        FL_OUT(block, FAILED, uint32_t)++;
+    if (FL_IN(block, WITHHOLD, uint8_t))
+        return FL_OK;
+    for (size_t i = 0; i < udp->address.count; i++) {
+        ssize_t sent = sendto(state->fd, block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
+                              (const struct sockaddr *)&state->to[i], sizeof state->to[i]);
+        if (sent == udp->length)
+            FL_OUT(block, SENT, uint32_t)++;
+        else
+            FL_OUT(block, FAILED, uint32_t)++;
+    }
     return FL_OK;
 }
 
@@ -120,8 +134,9 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(udp_send) = {
     .abi = FL_ABI,
     .name = "udp-send",
-    .summary = "sends a datagram each step, to one computer or all in reach: an input `data`, uint8",
+    .summary = "sends a datagram each step, to one computer, several or all in reach: an input `data`, uint8",
     .source = "RFC 768; RFC 2474 for the class of service; Linux: udp(7), ip(7)",
+    FL_TABLE(input, inputs),
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct udp_send),

@@ -5,7 +5,9 @@
 #include <string.h>
 
 enum interpolation { LINEAR, CUBIC, QUINTIC };
+enum { RESET, ELAPSED };
 enum { POSITION, VELOCITY, ACCELERATION, DONE };
+enum { LONGEST_S = 1000000000 }; /* that a begin may lie back */
 
 struct trajectory {
     struct fl_reals waypoints, times;
@@ -42,6 +44,12 @@ static const struct fl_port inputs[] = {
      .width = 1,
      .flags = FL_OPTIONAL,
      .summary = "1: waits at time zero, where it begins when this goes to 0"},
+    {.name = "elapsed",
+     .type = FL_DOUBLE,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .unit = "s",
+     .summary = "it begins at this time instead: where others are already"},
 };
 
 /* The number of points, or 0 after fl_fail(). */
@@ -180,10 +188,11 @@ static void be_between(struct fl_block *block, size_t from, double time)
 static int step(struct fl_block *block)
 {
     struct state *state = block->state;
-    if (FL_IN(block, 0, uint8_t))
+    double elapsed = FL_IN(block, ELAPSED, double);
+    if (FL_IN(block, RESET, uint8_t))
         return initialize(block);
     if (!state->begun)
-        state->begin_ns = block->release_ns;
+        state->begin_ns = block->release_ns - (elapsed > 0 && elapsed <= LONGEST_S ? llround(elapsed * 1e9) : 0);
     state->begun = true;
     /* By the clock, not by the count of steps: a step that was skipped must not delay the robot against the others. */
     double time = 1e-9 * (double)(block->release_ns - state->begin_ns);

@@ -140,6 +140,38 @@ static void hears_one_robot(void **state)
     testbed_end(to);
 }
 
+/* Who stands by is heard when the other is silent, and only then. */
+static void another_stands_by(void **state)
+{
+    (void)state;
+    struct fl_block *one = publisher((struct node){"wrench", "s", "1", NULL, NULL});
+    struct fl_block *two = publisher((struct node){"wrench", "s", "2", NULL, NULL});
+    struct fl_block *to = subscriber((struct node){"wrench", "s", "1,2", "failover", "1"});
+    assert_true(reaches(to, "flag", 1, one));
+    for (int i = 0; i < 20; i++) {
+        step(one);
+        step(two);
+        poll(NULL, 0, PERIOD_MS);
+        step(to);
+        assert_int_equal(GET(to, "sender", uint32_t), 0);
+    }
+    SET(one, "withhold", uint8_t, 1);
+    for (int waited = 0; waited < PATIENCE_MS && GET(to, "sender", uint32_t) != 1; waited += PERIOD_MS) {
+        step(one);
+        assert_true(reaches(two, "written", GET(two, "written", uint32_t) + 1, to));
+    }
+    assert_int_equal(GET(to, "sender", uint32_t), 1);
+    SET(one, "withhold", uint8_t, 0);
+    assert_true(reaches(to, "sender", 0, one));
+    testbed_end(one);
+    testbed_end(two);
+    testbed_end(to);
+    assert_non_null(strstr(testbed_refusal("dds-subscribe", "type", "wrench", "topic", "s", "robot", "1.5", NULL),
+                           "robot: 1.5 is no whole number"));
+    assert_non_null(strstr(testbed_refusal("dds-subscribe", "type", "wrench", "topic", "s", "robot", "1,2,3,4,5", NULL),
+                           "robot: give 1 to 4 numbers"));
+}
+
 static void takes_no_other_length(void **state)
 {
     (void)state;
@@ -304,6 +336,7 @@ int main(void)
         cmocka_unit_test(passes_a_state),
         cmocka_unit_test(passes_each_type),
         cmocka_unit_test(hears_one_robot),
+        cmocka_unit_test(another_stands_by),
         cmocka_unit_test(takes_no_other_length),
         cmocka_unit_test(qualities_are_asked_for),
         cmocka_unit_test(a_missed_deadline_is_no_good),

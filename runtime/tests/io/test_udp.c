@@ -6,6 +6,7 @@
 
 #include <math.h>
 #include <netinet/ip.h>
+#include <poll.h>
 #include <sys/socket.h>
 
 static void refuses_to_start(struct fl_block *block, const char *reason)
@@ -108,6 +109,64 @@ static void refuses_lengths_and_senders(void **state)
     close(right);
     close(wrong);
     testbed_end(receive);
+}
+
+/* Two senders that send the same, and the first of them dies and returns. A wide time-out: it is a loaded host's too.
+ */
+static void listens_to_the_first_that_speaks(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "1", "from", "127.0.0.2,127.0.0.3",
+                                             "failover", "0.5", NULL);
+    int first = bare("127.0.0.2", 0), second = bare("127.0.0.3", 0);
+    testbed_begin(receive);
+    send_to(first, port, "1", 1);
+    send_to(second, port, "2", 1);
+    testbed_step(receive);
+    assert_memory_equal(testbed_output(receive, "data"), "1", 1);
+    assert_int_equal(GET(receive, "sender", uint32_t), 0);
+    poll(NULL, 0, 600);
+    send_to(second, port, "2", 1);
+    testbed_step(receive);
+    assert_memory_equal(testbed_output(receive, "data"), "2", 1);
+    assert_int_equal(GET(receive, "sender", uint32_t), 1);
+    send_to(first, port, "1", 1);
+    send_to(second, port, "2", 1);
+    testbed_step(receive);
+    assert_memory_equal(testbed_output(receive, "data"), "1", 1);
+    assert_int_equal(GET(receive, "sender", uint32_t), 0);
+    assert_int_equal(GET(receive, "sequence", uint32_t), 3);
+    assert_int_equal(GET(receive, "refused", uint32_t), 0);
+    close(first);
+    close(second);
+    testbed_end(receive);
+}
+
+static void sends_to_several_or_withholds(void **state)
+{
+    (void)state;
+    int first = bare("127.0.0.2", 0), second = bare("127.0.0.3", port_of(first));
+    char port[8], byte;
+    snprintf(port, sizeof port, "%u", port_of(first));
+    struct fl_block *send =
+        testbed_block("udp-send", "address", "127.0.0.2,127.0.0.3", "port", port, "length", "1", NULL);
+    testbed_begin(send);
+    SET(send, "withhold", uint8_t, 1);
+    testbed_step(send);
+    SET(send, "withhold", uint8_t, 0);
+    SET(send, "data", uint8_t, 'x');
+    testbed_step(send);
+    settle();
+    assert_int_equal(GET(send, "sent", uint32_t), 2);
+    for (int i = 0; i < 2; i++) {
+        int fd = i ? second : first;
+        assert_int_equal(recv(fd, &byte, 1, MSG_DONTWAIT), 1);
+        assert_int_equal(byte, 'x');
+        assert_int_equal(recv(fd, &byte, 1, MSG_DONTWAIT), -1);
+        close(fd);
+    }
+    testbed_end(send);
 }
 
 static void flags_by_age(void **state)
@@ -335,6 +394,9 @@ static void refuses(void **state)
     assert_non_null(strstr(said_of_send("127.0.0.1", "::1"), "local_address: ::1 is not an IPv4 address"));
     assert_non_null(strstr(said_of_receive("0.0.0.0", "10.0.0"), "from: 10.0.0 is not an IPv4 address"));
     assert_non_null(strstr(said_of_receive("239.1.2.3", "0.0.0.0"), "239.1.2.3 is a multicast group"));
+    assert_non_null(strstr(said_of_receive("0.0.0.0", "10.0.0.1,0.0.0.0"), "from: 0.0.0.0 is anybody"));
+    assert_non_null(strstr(said_of_receive("0.0.0.0", "10.0.0.1,10.0.0.2,10.0.0.3,10.0.0.4,10.0.0.5"),
+                           "from: give 1 to 4 addresses"));
 }
 
 static void refuses_to_start_without(void **state)
@@ -363,6 +425,8 @@ int main(void)
         cmocka_unit_test(carries),
         cmocka_unit_test(takes_newest_or_in_order),
         cmocka_unit_test(refuses_lengths_and_senders),
+        cmocka_unit_test(listens_to_the_first_that_speaks),
+        cmocka_unit_test(sends_to_several_or_withholds),
         cmocka_unit_test(flags_by_age),
         cmocka_unit_test(ages_from_arrival),
         cmocka_unit_test(stamps_survive_a_set_clock),

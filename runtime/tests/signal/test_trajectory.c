@@ -1,6 +1,7 @@
 #include "testbed.h"
 
 #include <math.h>
+#include <stdlib.h>
 
 /* One step at `time` after the first, which must be done already or be this one with time 0. */
 static void at(struct fl_block *block, int64_t begin_ns, double time)
@@ -41,6 +42,31 @@ static void flies_the_square(void **state)
         assert_true(GET(block, "done", uint8_t));
     }
     testbed_end(block);
+}
+
+/* One that begins later is where the first one is, whatever its input says afterwards. */
+static void joins_another(void **state)
+{
+    (void)state;
+    const char *const late[] = {"0", "150", "-3", "nan", "1e300"};
+    const double x[] = {0, 1, 0, 0, 0}, y[] = {0, 0.5, 0, 0, 0};
+    for (size_t i = 0; i < sizeof late / sizeof late[0]; i++) {
+        struct fl_block *block =
+            testbed_block("trajectory", "dimensions", "2", "waypoints", "0,0,1,0,1,1,0,1,0,0", "speed", "0.01", NULL);
+        testbed_begin(block);
+        SET(block, "reset", uint8_t, 1);
+        SET(block, "elapsed", double, 42);
+        at(block, 0, 0);
+        expect(block, "position", 0, 0, 0);
+        SET(block, "reset", uint8_t, 0);
+        SET(block, "elapsed", double, strtod(late[i], NULL));
+        at(block, 0, 5);
+        expect(block, "position", x[i], y[i], 1e-9);
+        SET(block, "elapsed", double, 7);
+        at(block, 0, 15);
+        expect(block, "position", x[i] + (x[i] > 0 ? 0 : 0.1), y[i] + (x[i] > 0 ? 0.1 : 0), 1e-9);
+        testbed_end(block);
+    }
 }
 
 /* A polynomial's derivatives agree with differences of its values, it rests at both ends, and is half-way at half-time;
@@ -164,9 +190,13 @@ static void refuses(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(flies_the_square),    cmocka_unit_test(is_smooth),
-        cmocka_unit_test(waits_for_its_time),  cmocka_unit_test(begins_anew_after_a_reset),
-        cmocka_unit_test(passes_equal_points), cmocka_unit_test(refuses),
+        cmocka_unit_test(flies_the_square),
+        cmocka_unit_test(is_smooth),
+        cmocka_unit_test(joins_another),
+        cmocka_unit_test(waits_for_its_time),
+        cmocka_unit_test(begins_anew_after_a_reset),
+        cmocka_unit_test(passes_equal_points),
+        cmocka_unit_test(refuses),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
