@@ -274,6 +274,8 @@ class Robot(Host):
     devices: dict[DeviceName, Device] = {}
     control_tasks: list[TaskName] = []
     """Control tasks that start with the robot: `ansible/control_tasks/NAME.yml` each."""
+    standby: list[TaskName] = []
+    """Those of them that are another robot's first: this one's are listened to while that one is silent."""
 
 
 class Fleet(_Model):
@@ -286,13 +288,27 @@ class Fleet(_Model):
     """By number, ascending."""
     stations: list[Host]
 
-    def robot_with(self, task: str) -> Robot:
-        """The one robot that has a control task, for tasks that talk to it."""
+    def robots_with(self, task: str) -> list[Robot]:
+        """The one robot that has a control task, for tasks that talk to it; after it those that stand by for it."""
         there = [robot for robot in self.robots.values() if task in robot.control_tasks]
-        if len(there) != 1:
-            names = " and ".join(robot.name for robot in there) or "no robot"
-            raise UserError(f"control task {task}: {names} has it, and another task talks to the one that has")
-        return there[0]
+        first = [robot for robot in there if task not in robot.standby]
+        if len(first) != 1:
+            names = " and ".join(robot.name for robot in first) or "no robot"
+            raise UserError(
+                f"control task {task}: {names} has it, and another task talks to the one that has; "
+                "a further robot may stand by for it: standby in robots.yml"
+            )
+        return first + [robot for robot in there if task in robot.standby]
+
+    def robot_with(self, task: str) -> Robot:
+        """The same for a task that no other robot may stand by for."""
+        robot, *others = self.robots_with(task)
+        if others:
+            raise UserError(
+                f"control task {task}: no robot can stand by for it, and {others[0].name} does; "
+                "remove it from standby and control_tasks there"
+            )
+        return robot
 
     def interface(self, robot: Robot) -> str:
         """Kernel name of the interface that the robot's address belongs to."""

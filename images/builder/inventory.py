@@ -40,7 +40,8 @@ Scope = tuple[str, str]
 
 _HOMES = {"fleet_name": "all", "network": "all", "board": "board_*"}
 """Variables that hosts share, and the one group whose `group_vars/` sets them."""
-_VARIABLES = {"number", "address", "devices", "control_tasks", *_HOMES}
+_OF_ROBOTS = ("number", "devices", "control_tasks", "standby")
+_VARIABLES = {"address", *_OF_ROBOTS, *_HOMES}
 """The variables read here. Any others are Ansible's and its roles'."""
 
 _SYNTAX = "(syntax)"
@@ -422,7 +423,7 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
         findings += [((kind, host), message, remedy) for wrong, message, remedy in faults if wrong]
         member = {"name": host} | {key: variables[key] for key in ("address",) if key in variables}
         if kind == "robots":
-            member |= {key: variables[key] for key in ("number", "devices", "control_tasks") if key in variables}
+            member |= {key: variables[key] for key in _OF_ROBOTS if key in variables}
             member["board"] = own[0].removeprefix("board_") if own else ""
         raw[kind][host] = member
         if len(own) == 1:  # of several boards Ansible has merged one
@@ -554,20 +555,39 @@ def _devices(raw: dict[str, Any]) -> Iterator[Finding]:
                 yield loc, f"is the console's port ({console})", _free(ports, used.values(), console)
 
 
+def _named(raw: dict[str, Any], robot: str, key: str) -> dict[Loc, str]:
+    """Names in a robot's list of tasks."""
+    tasks = raw["robots"][robot].get(key)
+    return {
+        ("robots", robot, key, index): task
+        for index, task in enumerate(tasks if isinstance(tasks, list) else ())
+        if isinstance(task, str)
+    }
+
+
 def _tasks(raw: dict[str, Any]) -> Iterator[Finding]:
     there = sorted(path.stem for path in paths.TASKS.glob("*.yml"))
-    for name, robot in raw["robots"].items():
-        tasks = robot.get("control_tasks")
-        named = {
-            ("robots", name, "control_tasks", index): task
-            for index, task in enumerate(tasks if isinstance(tasks, list) else ())
-            if isinstance(task, str)
-        }
+    for name in raw["robots"]:
+        named = _named(raw, name, "control_tasks")
         for loc, task, _ in _again(named.items()):
             yield loc, f"{task} is listed already", "each task once"
         for loc, task in named.items():
             if task not in there:
                 yield loc, f"there is no file {paths.shown(paths.TASKS)}/{task}.yml", f"one of {', '.join(there)}"
+
+
+def _standby(raw: dict[str, Any]) -> Iterator[Finding]:
+    tasks = {name: set(_named(raw, name, "control_tasks").values()) for name in raw["robots"]}
+    named = {name: _named(raw, name, "standby") for name in raw["robots"]}
+    first = {task for name in raw["robots"] for task in tasks[name] - set(named[name].values())}
+    for name in raw["robots"]:
+        for loc, task, _ in _again(named[name].items()):
+            yield loc, f"{task} is listed already", "each task once"
+        for loc, task in named[name].items():
+            if task not in tasks[name]:
+                yield loc, f"{task} is none of {name}'s control tasks", "list it in control_tasks too, or remove it"
+            elif task not in first:
+                yield loc, f"no robot has {task} first", "remove it from one robot's standby: that one is listened to"
 
 
 def _free(ports: dict[str, Any] | None, used: Iterable[str], console: str | None) -> str:
@@ -608,4 +628,4 @@ def _radio(raw: dict[str, Any]) -> Iterator[Finding]:
         yield ("network", "ibss"), "is missing, and the link is ibss", "give ssid, frequency_mhz and bssid"
 
 
-_CHECKS = (_numbers, _addresses, _devices, _tasks, _boards, _radio)
+_CHECKS = (_numbers, _addresses, _devices, _tasks, _standby, _boards, _radio)

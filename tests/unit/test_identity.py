@@ -6,8 +6,10 @@ import json
 import shutil
 import stat
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import pytest
+import yaml
 
 from images.builder import identity, paths
 from images.builder.errors import UserError
@@ -95,6 +97,25 @@ def test_reading_a_description_pins_no_keys(fleet: Fleet, tmp_path: Path, monkey
         rendered = identity.render(flying, robot)
         assert files == {path.name: task for path, (task, _) in rendered.items() if path.parent == identity.TASKS}
         shutil.rmtree(paths.KEYS)
+
+
+def test_a_robot_that_stands_by_is_sent_to_and_listened_to() -> None:
+    """By both transports; a task that other tasks do not expect twice is refused."""
+
+    def rendered(transport: str, task: str, standby: dict[str, str]) -> dict[str, Any]:
+        flying = virtual.fleet(transport, standby)
+        robot = flying.robots_with(task)[0]
+        return dict(yaml.safe_load(identity.control_tasks(flying, robot)[task])["blocks"])
+
+    both = {"robot2": "control"}
+    assert rendered("udp", "navigation", both)["to_control"]["parameters"]["address"] == ["170.160.1.3", "170.160.1.2"]
+    assert rendered("udp", "thruster-mapping", both)["wrench"]["parameters"]["from"] == ["170.160.1.3", "170.160.1.2"]
+    assert rendered("dds", "thruster-mapping", both)["wrench"]["parameters"]["robot"] == [3, 2]
+    for transport in ("udp", "dds"):
+        assert rendered(transport, "control", both)["to_mapping"]["in"]["withhold"] == "silent.out"
+        assert "withhold" not in rendered(transport, "control", {})["to_mapping"]["in"]
+    with pytest.raises(UserError, match=r"navigation: no robot can stand by for it, and robot4 does"):
+        rendered("udp", "control", {"robot4": "navigation"})
 
 
 def test_every_port_in_use_gets_its_name_and_baud_rate(fleet: Fleet) -> None:

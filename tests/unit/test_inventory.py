@@ -56,7 +56,7 @@ CASES = {
         ROBOTS, "10.42.0.254", "10.42.0.1", "station.address", "is robot1's address…10.42.0.5"
     ),
     "copied without a new name": Case(
-        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 51…another name"
+        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 53…another name"
     ),
     # One robot
     "number 0": Case(ROBOTS, "number: 4", "number: 0", "robot4.number", "out of range…1 to 250"),
@@ -107,6 +107,31 @@ CASES = {
         ROBOTS, "[heading]", "[haeding]", "robot1.control_tasks.0", "no file…one of control, heading", "haeding"
     ),
     "task twice": Case(ROBOTS, "[heading]", "[heading, heading]", "robot1.control_tasks.1", "already…once", "heading"),
+    "stands by for a task it has not": Case(
+        ROBOTS,
+        "[heading]",
+        "[heading]\n          standby: [control]",
+        "robot1.standby.0",
+        "none of robot1's…control_tasks",
+        "standby",
+    ),
+    "all stand by": Case(
+        ROBOTS,
+        "[heading]",
+        "[heading]\n          standby: [heading]",
+        "robot1.standby.0",
+        "no robot has heading first",
+        "standby",
+    ),
+    "stands by twice": Case(
+        ROBOTS,
+        "[heading]",
+        "[heading]\n          standby: [heading, heading]",
+        "robot1.standby.1",
+        "listed already",
+        "standby",
+        also=2,
+    ),
     "task's name": Case(
         ROBOTS, "[heading]", "[Head.ing]", "robot1.control_tasks.0", "not a task's name", "Head", also=1
     ),
