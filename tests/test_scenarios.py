@@ -7,6 +7,7 @@ drifts) and open (it spun). All flights are of one guest; `make scenarios` flies
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -19,7 +20,7 @@ from images.builder.fleet import Board, Fleet
 from tests.lab.perturb import perturbed_host
 from tests.scenarios import gate, report, virtual
 from tests.scenarios.flight import HOPS, Flight
-from tests.scenarios.plans import TESTED_SIDE_M, plans
+from tests.scenarios.plans import TESTED_SIDE_M, plans, standby
 
 pytestmark = pytest.mark.boot
 
@@ -42,6 +43,12 @@ RECORD_S = 0.05
 """Between two records of the plant."""
 TIMEOUT_NS = round((TIMEOUT_S + RECORD_S) * 1e9)
 
+HANDOVER_S = 0.055
+"""Between two commands at the valves when another computer takes over: 0.03 s until it is listened to, a period until
+it says something then, a period for the four hops, and half a one because steps without a message are that late."""
+RESTART_S = 1.5
+"""Until a task that was started is listened to."""
+
 REPEATED = (
     virtual.square("udp", "by UDP", 0.01),
     virtual.square("dds", "by DDS", 0.01, transport="dds"),
@@ -60,6 +67,12 @@ def flown(board: Board, session_artefacts: Path) -> dict[str, Flight]:
 
 
 @pytest.fixture(scope="module")
+def stood_by(board: Board, session_artefacts: Path) -> dict[str, Flight]:
+    directories = virtual.fly(standby(TESTED_SIDE_M), board, session_artefacts / "standby")
+    return {name: Flight.read(directory) for name, directory in directories.items()}
+
+
+@pytest.fixture(scope="module")
 def flights(flown: dict[str, Flight]) -> Callable[[str], Flight]:
     return lambda name: flown[name]
 
@@ -67,7 +80,10 @@ def flights(flown: dict[str, Flight]) -> Callable[[str], Flight]:
 @pytest.mark.parametrize("name", ["udp", "dds", "loss", "disorder", "gaps", "strangers"])
 def test_the_square_is_flown(flights: Callable[[str], Flight], name: str) -> None:
     """Seen to fail, by the thrusters, with arms of 10 cm: a pulse was more than the controller's dead band."""
-    flight = flights(name)
+    square_is_flown(name, flights(name))
+
+
+def square_is_flown(name: str, flight: Flight) -> None:
     seconds = 4 * TESTED_SIDE_M / 0.01
     error, thrusters = flight.error(), flight.thrusters()
     print(f"{name}: RMS {error.rms_m * 1000:.1f} mm, at most {error.max_m * 1000:.1f} mm")
@@ -117,6 +133,67 @@ def test_a_computer_without_power_closes_the_valves_until_it_is_back(flights: Ca
     assert len(gone) == 1
     back_ns = next(time_ns for time_ns in opened if opened[time_ns] not in gone)
     print(f"control resumes {(back_ns - on_ns) / 1e9:.2f} s after the tasks start")
+
+
+def controllers(flight: Flight) -> list[tuple[int, int]]:
+    """Who controlled, 0 or the one that stands by, and from when on."""
+    found: list[tuple[int, int]] = []
+    for record in flight.arrived:
+        if not found or record["controller"] != found[-1][0]:
+            found.append((record["controller"], record["time_ns"]))
+    return found
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["standby", "standby-dds"])
+def test_another_computer_takes_over_control(stood_by: dict[str, Flight], name: str) -> None:
+    """And hands back when the first one is there again, which then goes on alone."""
+    flight = stood_by[name]
+    off_ns, on_ns, alone_ns = flight.events_ns
+    (first, _), (second, over_ns), (third, back_ns) = controllers(flight)
+    print(
+        f"{name}: taken over {(over_ns - off_ns) / 1e6:.1f} ms after power off, back {(back_ns - on_ns) / 1e9:.2f} s on"
+    )
+    assert (first, second, third) == (0, 1, 0)
+    assert 0 < over_ns - off_ns <= HANDOVER_S * 1e9
+    assert 0 < back_ns - on_ns <= RESTART_S * 1e9
+    begin_ns = flight.commanded[0]["time_ns"]
+    flying = [record for record in flight.steps if record["time_ns"] >= begin_ns]
+    assert all(record["good"] for record in flying), "valves were to be closed"
+    arrived = [record["time_ns"] for record in flight.arrived if record["time_ns"] >= begin_ns]
+    longest_ns = max(after - before for before, after in itertools.pairwise(arrived))
+    print(f"{name}: at most {longest_ns / 1e6:.1f} ms between commands; {flight.lost()} steps lost")
+    assert longest_ns <= HANDOVER_S * 1e9
+    assert arrived[-1] > alone_ns + 1e9, "the flight ends too early"
+    square_is_flown(name, flight)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["standby", "standby-dds"])
+def test_who_takes_over_is_at_the_same_point_of_the_path(stood_by: dict[str, Flight], name: str) -> None:
+    """Seen to fail with a controller that begins the path by its own clock."""
+    commanded = stood_by[name].commanded
+    jumps = [
+        math.dist(before["wanted"], after["wanted"]) - 0.01 * (after["time_ns"] - before["time_ns"]) / 1e9
+        for before, after in itertools.pairwise(commanded)
+    ]
+    print(f"{name}: the wanted position is at most {max(jumps) * 1000:.2f} mm farther than the speed takes it")
+    assert max(jumps) < 0.001
+
+
+@pytest.mark.long
+def test_without_another_the_robot_coasts(stood_by: dict[str, Flight]) -> None:
+    """The negative control: valves are closed all the time, and it leaves the path."""
+    flight = stood_by["no-standby"]
+    off_ns, on_ns = flight.events_ns
+    gone = [record for record in flight.since(off_ns + TIMEOUT_NS) if record["time_ns"] < on_ns]
+    assert len(gone) > 50
+    assert len({sum(record["on_time"]) for record in gone}) == 1
+    there, wanted = flight.pose_at(on_ns), stood_by["standby"].pose_at(stood_by["standby"].events_ns[1])
+    distance = math.dist(there[:2], wanted[:2])
+    print(f"{distance * 1000:.1f} mm from where it is with another")
+    assert distance > 2 * RMS_M
+    assert {who for who, _ in controllers(flight)} == {0}
 
 
 def test_strangers_are_refused_and_counted(flights: Callable[[str], Flight]) -> None:

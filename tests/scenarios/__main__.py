@@ -11,7 +11,7 @@ from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
 from tests.scenarios import gate, guests, report, virtual
 from tests.scenarios.flight import Flight
-from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans
+from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans, standby
 from tests.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
@@ -26,7 +26,7 @@ def _flown(chosen: Sequence[Plan]) -> dict[str, Flight]:
 
 
 def _fly(names: list[str], side_m: float) -> None:
-    there = {plan.name: plan for plan in plans(side_m)}
+    there = {plan.name: plan for plan in (*plans(side_m), *standby(side_m))}
     for name in names:
         if name not in there:
             raise UserError(f"{name}: there is no such flight; there are {', '.join(there)}")

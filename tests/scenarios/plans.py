@@ -29,6 +29,13 @@ _GAPS = (
     Event.on(10, "robot3", "iw", "dev", "wlan0", "ibss", "leave"),
     Event.on(10.5, "robot3", "/usr/lib/flotilla/ibss", "wlan0"),
 )
+_CONTROL_LOST = (Event(6, "power-off", ["robot3"]), Event(10.5, "power-on", ["robot3"]))
+"""Over two sides of the square."""
+_STANDBY = {
+    "events": (*_CONTROL_LOST, Event(13, "lose", ["control-standby"])),
+    "standby": {"robot2": "control"},
+}
+"""At last the first one is alone."""
 STATION_GONE_S = 4
 """Before the flight's end."""
 _SPIN = {"initial_velocity": [0, 0, 1]}
@@ -50,6 +57,18 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
             changes={"valves.relays.timeout": 60},
         ),
     )  # fmt: skip
+
+
+def standby(side_m: float) -> tuple[Plan, ...]:
+    """The controller's computer is without power for a while, with and without another that stands by.
+
+    Apart from the others, because tests fly these in a guest of their own.
+    """
+    return (
+        square("standby", "the square, another computer takes over control", side_m, **_STANDBY),
+        square("standby-dds", "the same by DDS", side_m, transport="dds", **_STANDBY),
+        square("no-standby", "the same without another", side_m, events=_CONTROL_LOST, seconds=12),
+    )
 
 
 def _strangers(side_m: float) -> Plan:

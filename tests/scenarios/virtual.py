@@ -29,6 +29,8 @@ INVENTORY = HERE / "inventory"
 PLANT = paths.PROJECT / "tests" / "plant"
 DIRECTORY = subject.DIRECTORY
 STATION = "station"
+STANDBY = "-standby"
+"""After the name of a task that stands by for another's."""
 STRANGER = "stranger"
 """A computer in the cell that is not of the fleet."""
 RELAYS = ("-chardev", "null,id=relays", "-device", "isa-parallel,iobase=0x300,chardev=relays")
@@ -69,6 +71,8 @@ class Plan:
     events: Sequence[Event] = ()
     plant: Mapping[str, object] = field(default_factory=dict)
     """Parameters that are not those of floating_robot.yml."""
+    standby: Mapping[str, str] = field(default_factory=dict)
+    """Robots by name, and the control task for which each stands by."""
     stranger: bool = False
     """A computer that is not of the fleet sends to all ports of the control tasks, as often as they step."""
     changes: Mapping[str, object] = field(default_factory=dict)
@@ -81,11 +85,16 @@ def square(name: str, title: str, side_m: float, **more: Any) -> Plan:
     return replace(Plan(name, title, 4 * side_m / 0.01 + 6, changes={"control.path.waypoints": corners}), **more)
 
 
-def fleet(transport: str) -> Fleet:
-    """The published laboratory's."""
+def fleet(transport: str, standby: Mapping[str, str] | None = None) -> Fleet:
+    """The published laboratory's, with robots that stand by for others."""
     described = inventory.load_fleet(INVENTORY)
     network = described.network.model_copy(update={"transport": transport})
-    return described.model_copy(update={"network": network})
+    robots = dict(described.robots)
+    for number, robot in described.robots.items():
+        if task := (standby or {}).get(robot.name):
+            more = {"control_tasks": [*robot.control_tasks, task], "standby": [task]}
+            robots[number] = robot.model_copy(update=more)
+    return described.model_copy(update={"network": network, "robots": robots})
 
 
 def _rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
@@ -153,7 +162,7 @@ def _parsed(task: bytes) -> Any:
 def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """A flight as fly.py reads it, and its files by path."""
     directory = DIRECTORY / plan.name
-    described = fleet(plan.transport)
+    described = fleet(plan.transport, plan.standby)
     flying = described.robot_with("valves")
     brought = _rendered(described, keys)
     robot_parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
@@ -164,7 +173,9 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
             robot_address=flying.address,
             gyro=gyro_device(described, board),
         ),
-        f"{directory}/station.yml": _own("station.yml.j2", **_streams(described, brought)),
+        f"{directory}/station.yml": _own(
+            "station.yml.j2", controllers=described.robots_with("control"), **_streams(described, brought)
+        ),
     }
     tasks = [
         {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
@@ -174,9 +185,10 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
         configuration = f"{directory}/{robot.name}-cyclonedds.xml"
         there[configuration] = brought[robot.name]["/etc/flotilla/cyclonedds.xml"]
         for name in robot.control_tasks:
-            file = f"{directory}/{name}.yml"
+            called = name + STANDBY if name in robot.standby else name
+            file = f"{directory}/{called}.yml"
             there[file] = changed(name, brought[robot.name][_path(name)], plan.changes)
-            tasks.append({"name": name, "computer": robot.name, "file": file, "cyclonedds": configuration})
+            tasks.append({"name": called, "computer": robot.name, "file": file, "cyclonedds": configuration})
     events = [asdict(event) for event in plan.events]
     if plan.stranger:
         shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]
