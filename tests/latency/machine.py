@@ -76,6 +76,8 @@ class Machine:
     """A raw image as IDE disk. With one, results do not repeat: the host decides when it answers."""
     extra: tuple[str, ...] = ()
     """Further arguments of QEMU, such as devices that the board does not have by itself."""
+    shift: int = 3
+    """An instruction takes 2**shift ns of virtual time."""
 
     def run(self, directory: Path, timeout_s: float) -> bytes:
         """What the guest wrote to its last serial connector; `console.log` and `qemu.command` stay in `directory`.
@@ -93,7 +95,14 @@ class Machine:
         argv += ["-machine", f"{board.qemu.machine},usb=off,hpet=off", "-cpu", board.qemu.cpu]
         argv += ["-m", str(board.qemu.memory_mib), "-accel", "tcg,thread=single,tb-size=1024"]
         recorded = "" if self.disk else ",rr=record,rrfile=/dev/null"
-        argv += ["-icount", f"shift=3,sleep=off{recorded}", "-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"]
+        argv += [
+            "-icount",
+            f"shift={self.shift},sleep=off{recorded}",
+            "-rtc",
+            "base=2026-01-01T00:00:00,clock=vm",
+            "-seed",
+            "1",
+        ]
         argv += ["-kernel", str(self.kernel), "-initrd", str(self.initrd), "-append", " ".join(self.arguments)]
         argv += ["-no-reboot", "-device", f"{board.qemu.network},id=nic,mac=52:54:00:f1:00:01,romfile="]
         if self.disk:

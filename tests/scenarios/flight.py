@@ -53,6 +53,8 @@ class Flight:
     """What tasks wrote at their end, by name; empty where they were not asked to."""
     events_ns: list[int] = field(default_factory=list)
     """When the events of the plan had happened."""
+    heard_too: list[Record] = field(default_factory=list)
+    """What a second station heard of the steps; empty where there was none."""
     one_clock: bool = True
     """Whether stamps of different computers may be compared, as in virtual time."""
 
@@ -65,6 +67,7 @@ class Flight:
             _records(directory / "station", "controls"),
             {path.parent.name: json.loads(path.read_text()) for path in sorted(directory.glob("*/statistics.json"))},
             json.loads((directory / "events.json").read_text()),
+            _records(directory / "second", "steps") if (directory / "second").exists() else [],
         )
 
     @cached_property

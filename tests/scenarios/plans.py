@@ -72,8 +72,8 @@ def standby(side_m: float) -> tuple[Plan, ...]:
 
 
 def _strangers(side_m: float) -> Plan:
-    title = "the square, a stranger in the cell, the clock set, at last no station"
-    plan = square("strangers", title, side_m, stranger=True)
+    title = "the square, a stranger and a second station in the cell, the clock set, at last not the first station"
+    plan = square("strangers", title, side_m, stranger=True, second_station=True)
     seconds = plan.seconds + STATION_GONE_S
     events = (Event(5, "run", ["date", "--set", "+1 hour"]), Event(plan.seconds, "lose", ["station"]))
     return replace(plan, seconds=seconds, events=events)

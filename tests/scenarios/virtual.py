@@ -20,7 +20,7 @@ import yaml
 
 from images.builder import identity, inventory, paths, runtime
 from images.builder.errors import UserError
-from images.builder.fleet import Board, Fleet
+from images.builder.fleet import Board, Fleet, Host
 from runtime.station import telemetry
 from tests.latency import machine, results, subject
 
@@ -29,6 +29,8 @@ INVENTORY = HERE / "inventory"
 PLANT = paths.PROJECT / "tests" / "plant"
 DIRECTORY = subject.DIRECTORY
 STATION = "station"
+SECOND = "second"
+"""A further station, in the cell in each flight, and of the fleet in those whose plan says so."""
 STANDBY = "-standby"
 """After the name of a task that stands by for another's."""
 STRANGER = "stranger"
@@ -73,6 +75,8 @@ class Plan:
     """Parameters that are not those of floating_robot.yml."""
     standby: Mapping[str, str] = field(default_factory=dict)
     """Robots by name, and the control task for which each stands by."""
+    second_station: bool = False
+    """A further station of the fleet hears what the first one hears, and says wrongly where the robot is."""
     stranger: bool = False
     """A computer that is not of the fleet sends to all ports of the control tasks, as often as they step."""
     changes: Mapping[str, object] = field(default_factory=dict)
@@ -85,8 +89,8 @@ def square(name: str, title: str, side_m: float, **more: Any) -> Plan:
     return replace(Plan(name, title, 4 * side_m / 0.01 + 6, changes={"control.path.waypoints": corners}), **more)
 
 
-def fleet(transport: str, standby: Mapping[str, str] | None = None) -> Fleet:
-    """The published laboratory's, with robots that stand by for others."""
+def fleet(transport: str, standby: Mapping[str, str] | None = None, *, second_station: bool = False) -> Fleet:
+    """The published laboratory's, with robots that stand by for others, and a further station."""
     described = inventory.load_fleet(INVENTORY)
     network = described.network.model_copy(update={"transport": transport})
     robots = dict(described.robots)
@@ -94,7 +98,12 @@ def fleet(transport: str, standby: Mapping[str, str] | None = None) -> Fleet:
         if task := (standby or {}).get(robot.name):
             more = {"control_tasks": [*robot.control_tasks, task], "standby": [task]}
             robots[number] = robot.model_copy(update=more)
-    return described.model_copy(update={"network": network, "robots": robots})
+    stations = described.stations + [second(described)] * second_station
+    return described.model_copy(update={"network": network, "robots": robots, "stations": stations})
+
+
+def second(described: Fleet) -> Host:
+    return Host(name=SECOND, address=described.network.subnet.broadcast_address - 3)
 
 
 def _rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
@@ -162,7 +171,7 @@ def _parsed(task: bytes) -> Any:
 def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """A flight as fly.py reads it, and its files by path."""
     directory = DIRECTORY / plan.name
-    described = fleet(plan.transport, plan.standby)
+    described = fleet(plan.transport, plan.standby, second_station=plan.second_station)
     flying = described.robot_with("valves")
     brought = _rendered(described, keys)
     robot_parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
@@ -181,6 +190,12 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
         {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
         {"name": "plant", "computer": STATION, "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
     ]
+    if plan.second_station:
+        there[f"{directory}/{SECOND}.yml"] = _own("second.yml.j2", robot_address=flying.address)
+        tasks += [
+            {"name": SECOND, "computer": SECOND, "file": f"{directory}/station.yml"},
+            {"name": f"{SECOND}-igps", "computer": SECOND, "file": f"{directory}/{SECOND}.yml"},
+        ]
     for robot in described.robots.values():
         configuration = f"{directory}/{robot.name}-cyclonedds.xml"
         there[configuration] = brought[robot.name]["/etc/flotilla/cyclonedds.xml"]
@@ -217,7 +232,7 @@ def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
         flights.append(flight)
         there |= brought
     length = described.network.subnet.prefixlen
-    hosts = [*described.robots.values(), *described.stations]
+    hosts = [*described.robots.values(), *described.stations, second(described)]
     addresses = {host.name: str(host.address) for host in hosts}
     addresses[STRANGER] = str(described.network.subnet.broadcast_address - 2)
     session = {
