@@ -42,9 +42,10 @@ static const struct fl_port outputs[] = {
 enum { WITHHOLD, DATA };
 enum { SENT, FAILED };
 
+/* A socket each: what waits for the hardware address of a computer that is gone fills its socket. */
 struct state {
-    bool open;
-    int fd;
+    size_t open;
+    int fd[FL_SENDERS];
     struct sockaddr_in to[FL_SENDERS];
 };
 
@@ -96,13 +97,15 @@ static int start(struct fl_block *block)
         if (!udp->broadcast && refuse_broadcast(block, &state->to[i], udp->address.value[i]) != FL_OK)
             return FL_FAILED;
     }
-    state->fd = udp_open(block, udp->local_address, 0, udp->interface);
-    if (state->fd < 0)
-        return FL_FAILED;
-    state->open = true;
-    if (setsockopt(state->fd, SOL_SOCKET, SO_BROADCAST, &on, sizeof on) < 0 ||
-        setsockopt(state->fd, IPPROTO_IP, IP_TOS, &service, sizeof service) < 0)
-        return fl_fail(block, "cannot set up the UDP socket: %s", strerror(errno));
+    for (size_t i = 0; i < udp->address.count; i++) {
+        state->fd[i] = udp_open(block, udp->local_address, 0, udp->interface);
+        if (state->fd[i] < 0)
+            return FL_FAILED;
+        state->open++;
+        if (setsockopt(state->fd[i], SOL_SOCKET, SO_BROADCAST, &on, sizeof on) < 0 ||
+            setsockopt(state->fd[i], IPPROTO_IP, IP_TOS, &service, sizeof service) < 0)
+            return fl_fail(block, "cannot set up the UDP socket: %s", strerror(errno));
+    }
     return FL_OK;
 }
 
@@ -113,7 +116,7 @@ static int step(struct fl_block *block)
     if (FL_IN(block, WITHHOLD, uint8_t))
         return FL_OK;
     for (size_t i = 0; i < udp->address.count; i++) {
-        ssize_t sent = sendto(state->fd, block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
+        ssize_t sent = sendto(state->fd[i], block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
                               (const struct sockaddr *)&state->to[i], sizeof state->to[i]);
         if (sent == udp->length)
             FL_OUT(block, SENT, uint32_t)++;
@@ -126,9 +129,8 @@ static int step(struct fl_block *block)
 static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
-    if (state->open)
-        close(state->fd);
-    state->open = false;
+    while (state->open)
+        close(state->fd[--state->open]);
 }
 
 FL_BLOCK(udp_send) = {
