@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -136,49 +137,52 @@ def test_a_computer_without_power_closes_the_valves_until_it_is_back(flights: Ca
 
 
 def controllers(flight: Flight) -> list[tuple[int, int]]:
-    """Who controlled, 0 or the one that stands by, and from when on."""
+    """Who controls while the path is flown, 0 or the one that stands by, and from when on."""
     found: list[tuple[int, int]] = []
-    for record in flight.arrived:
+    for record in commands(flight):
         if not found or record["controller"] != found[-1][0]:
-            found.append((record["controller"], record["time_ns"]))
+            found.append((record["controller"], record["now_ns"]))
     return found
+
+
+def commands(flight: Flight) -> list[dict[str, Any]]:
+    """Those that reached the valves while the path is flown."""
+    return [record for record in flight.arrived if record["now_ns"] >= flight.commanded[0]["time_ns"]]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["standby", "standby-dds"])
 def test_another_computer_takes_over_control(stood_by: dict[str, Flight], name: str) -> None:
-    """And hands back when the first one is there again, which then goes on alone."""
+    """And hands back when the first one is there again, which then goes on alone. Seen to fail by DDS when it returned:
+    1.2 s without commands."""
     flight = stood_by[name]
-    off_ns, on_ns, alone_ns = flight.events_ns
-    (first, _), (second, over_ns), (third, back_ns) = controllers(flight)
-    print(
-        f"{name}: taken over {(over_ns - off_ns) / 1e6:.1f} ms after power off, back {(back_ns - on_ns) / 1e9:.2f} s on"
-    )
-    assert (first, second, third) == (0, 1, 0)
-    assert 0 < over_ns - off_ns <= HANDOVER_S * 1e9
-    assert 0 < back_ns - on_ns <= RESTART_S * 1e9
+    off_ns, *later_ns = flight.events_ns
+    who = controllers(flight)
+    assert [number for number, _ in who] == ([0, 1, 0] if later_ns else [0, 1])
+    assert who[1][1] <= off_ns + HANDOVER_S * 1e9
+    for (_, back_ns), on_ns in zip(who[2:], later_ns, strict=False):
+        print(f"{name}: back {(back_ns - on_ns) / 1e9:.2f} s after power on")
+        assert 0 < back_ns - on_ns <= RESTART_S * 1e9
     begin_ns = flight.commanded[0]["time_ns"]
-    flying = [record for record in flight.steps if record["time_ns"] >= begin_ns]
-    assert all(record["good"] for record in flying), "valves were to be closed"
-    arrived = [record["time_ns"] for record in flight.arrived if record["time_ns"] >= begin_ns]
+    assert all(record["good"] for record in flight.steps if record["now_ns"] >= begin_ns), "valves were to be closed"
+    arrived = [record["now_ns"] for record in commands(flight)]
     longest_ns = max(after - before for before, after in itertools.pairwise(arrived))
     print(f"{name}: at most {longest_ns / 1e6:.1f} ms between commands; {flight.lost()} steps lost")
     assert longest_ns <= HANDOVER_S * 1e9
-    assert arrived[-1] > alone_ns + 1e9, "the flight ends too early"
+    assert arrived[-1] > flight.events_ns[-1] + 1e9, "the flight ends too early"
     square_is_flown(name, flight)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["standby", "standby-dds"])
 def test_who_takes_over_is_at_the_same_point_of_the_path(stood_by: dict[str, Flight], name: str) -> None:
-    """Seen to fail with a controller that begins the path by its own clock."""
     commanded = stood_by[name].commanded
-    jumps = [
-        math.dist(before["wanted"], after["wanted"]) - 0.01 * (after["time_ns"] - before["time_ns"]) / 1e9
-        for before, after in itertools.pairwise(commanded)
-    ]
-    print(f"{name}: the wanted position is at most {max(jumps) * 1000:.2f} mm farther than the speed takes it")
-    assert max(jumps) < 0.001
+    farthest_m = 0.0
+    for before, after in itertools.pairwise(commanded):  # by their time and by the robot's, either of which may be old
+        seconds = max((after["time_ns"] - before["time_ns"]) / 1e9, 0.01 * (after["number"] - before["number"]))
+        farthest_m = max(farthest_m, math.dist(before["wanted"], after["wanted"]) - 0.01 * seconds)
+    print(f"{name}: the wanted position is at most {farthest_m * 1000:.2f} mm farther than the speed takes it")
+    assert farthest_m < 0.001
 
 
 @pytest.mark.long

@@ -31,11 +31,10 @@ _GAPS = (
 )
 _CONTROL_LOST = (Event(6, "power-off", ["robot3"]), Event(10.5, "power-on", ["robot3"]))
 """Over two sides of the square."""
-_STANDBY = {
-    "events": (*_CONTROL_LOST, Event(13, "lose", ["control-standby"])),
-    "standby": {"robot2": "control"},
-}
-"""At last the first one is alone."""
+_FIRST_ALONE = Event(13.5, "lose", ["control-standby"])
+_STANDBY = {"robot2": "control"}
+_DDS_LATER_S = 4
+"""Tasks that use DDS take that much longer to start, as long as all share one processor."""
 STATION_GONE_S = 4
 """Before the flight's end."""
 _SPIN = {"initial_velocity": [0, 0, 1]}
@@ -60,15 +59,24 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
 
 
 def standby(side_m: float) -> tuple[Plan, ...]:
-    """The controller's computer is without power for a while, with and without another that stands by.
+    """The controller's computer loses power, with and without another that stands by; by UDP it returns.
 
-    Apart from the others, because tests fly these in a guest of their own.
+    By DDS it does not: a task that starts to use DDS keeps the one processor, which is all computers, from control for
+    more than a second. Apart from the others, because tests fly these in a guest of their own.
     """
+    lost, _ = _CONTROL_LOST
     return (
-        square("standby", "the square, another computer takes over control", side_m, **_STANDBY),
-        square("standby-dds", "the same by DDS", side_m, transport="dds", **_STANDBY),
+        square(
+            "standby", "the square, another computer takes over control and hands back", side_m,
+            events=(*_CONTROL_LOST, _FIRST_ALONE), standby=_STANDBY,
+        ),
+        square(
+            "standby-dds", "the square, another computer takes over control, by DDS", side_m, transport="dds",
+            events=(replace(lost, at_s=lost.at_s + _DDS_LATER_S),), standby=_STANDBY,
+            seconds=4 * side_m / 0.01 + 6 + _DDS_LATER_S,
+        ),
         square("no-standby", "the same without another", side_m, events=_CONTROL_LOST, seconds=12),
-    )
+    )  # fmt: skip
 
 
 def _strangers(side_m: float) -> Plan:
