@@ -177,8 +177,8 @@ latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and make that
 boot-time: | setup-tests ## where a boot spends its time, in virtual time
 	$(Q)$(LATENCY) boot-time $(measured)
 
-scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=1] [FLIGHTS="udp dds"] [ON=guests]
-	$(Q)$(PYTHON) -m tests.scenarios $(if $(filter guests,$(ON)),--guests) $(if $(SIDE),--side $(SIDE)) $(FLIGHTS)
+scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=1] [FLIGHTS="udp dds"] [ON=guests | ROBOTS=16]
+	$(Q)$(PYTHON) -m tests.scenarios $(if $(filter guests,$(ON)),--guests) $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SIDE),--side $(SIDE)) $(FLIGHTS)
 
 scenarios-accept: | setup-tests ## make a new run the accepted one: commit tests/scenarios/baseline.json
 	$(Q)$(PYTHON) -m tests.scenarios --accept

@@ -9,18 +9,24 @@ from collections.abc import Sequence
 
 from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
-from tests.scenarios import gate, guests, report, virtual
+from images.builder.fleet import Board
+from tests.scenarios import crowd, gate, guests, report, virtual
 from tests.scenarios.flight import Flight
 from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans, standby
 from tests.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
 GUESTS = paths.BUILD / "flights"
+CROWD = paths.BUILD / "crowd"
+
+
+def _board() -> Board:
+    return inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
 
 
 def _flown(chosen: Sequence[Plan]) -> dict[str, Flight]:
     shutil.rmtree(OUT, ignore_errors=True)
-    board = inventory.load_fleet().boards["smartcoret3"].model_copy(update={"kernel": "lean"})
+    board = _board()
     with progress.step(f"{len(chosen)} flights, {sum(plan.seconds for plan in chosen):g} virtual seconds"):
         return {name: Flight.read(directory) for name, directory in virtual.fly(chosen, board, OUT).items()}
 
@@ -47,6 +53,25 @@ def _fly_guests(names: list[str], side_m: float) -> None:
     print(f"{paths.shown(page)}; consoles of the guests: {paths.shown(GUESTS)}")
 
 
+def crowds(most: int) -> None:
+    """Measure these many robots and fewer."""
+    sizes = [size for size in crowd.SIZES if size <= most]
+    if not sizes:
+        raise UserError(f"{most} robots: give {', '.join(map(str, crowd.SIZES))}, and all up to that are measured")
+    shutil.rmtree(CROWD, ignore_errors=True)
+    measured = []
+    for size in sizes:
+        with progress.step(f"{size} robots, {crowd.SECONDS:g} virtual seconds"):
+            measured.append(crowd.measure(size, _board(), CROWD / str(size)))
+    for found in measured:
+        percentiles = found.latency.percentiles_us
+        print(
+            f"{found.robots:3} robots, {found.loops} loops: {found.lost} of {found.steps} steps lost; four hops: "
+            f"median {percentiles['50']} µs, 99.9 % {percentiles['99.9']}, max {found.latency.max_us}"
+        )
+    print(paths.shown(report.write_crowds(measured, paths.BUILD / "reports")))
+
+
 def _accept() -> None:
     gate.accept(gate.latencies(_flown(plans(TESTED_SIDE_M))))
     print(f"{paths.shown(gate.BASELINE)} has the hops of these flights; commit it")
@@ -57,6 +82,7 @@ def main() -> int:
     parser.add_argument("flights", nargs="*", help="names; without, all")
     parser.add_argument("--side", type=float, default=SIDE_M, metavar="M", help="of the square (%(default)s m)")
     parser.add_argument("--guests", action="store_true", help="in real time, by guests of the card images")
+    parser.add_argument("--robots", type=int, metavar="N", help="instead, latency and loss with up to so many robots")
     parser.add_argument("--accept", action="store_true", help="fly as the tests do, and accept the hops' latencies")
     arguments = parser.parse_args()
 
@@ -65,6 +91,8 @@ def main() -> int:
             raise UserError(f"--side {arguments.side:g}: is not from 0.01 to 10 m")
         if arguments.accept:
             _accept()
+        elif arguments.robots is not None:
+            crowds(arguments.robots)
         else:
             (_fly_guests if arguments.guests else _fly)(arguments.flights, arguments.side)
 

@@ -62,12 +62,12 @@ class Flight:
     def read(cls, directory: Path) -> Flight:
         """What `virtual.fly` returned."""
         return cls(
-            _records(directory / "plant", "flown"),
-            _records(directory / "station", "steps"),
-            _records(directory / "station", "controls"),
+            records(directory / "plant", "flown"),
+            records(directory / "station", "steps"),
+            records(directory / "station", "controls"),
             {path.parent.name: json.loads(path.read_text()) for path in sorted(directory.glob("*/statistics.json"))},
             json.loads((directory / "events.json").read_text()),
-            _records(directory / "second", "steps") if (directory / "second").exists() else [],
+            records(directory / "second", "steps") if (directory / "second").exists() else [],
         )
 
     @cached_property
@@ -135,8 +135,8 @@ class Flight:
         return numbers[-1] - numbers[0] + 1 - len(numbers)
 
 
-def _records(directory: Path, name: str) -> list[Record]:
-    """All records of a recorder."""
+def records(directory: Path, name: str) -> list[Record]:
+    """All that a recorder of a task wrote."""
     files = sorted(directory.glob(f"{name}-*.rec"))
     if not files:
         raise FileNotFoundError(f"{directory} has no recording {name}")

@@ -6,7 +6,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jinja2
@@ -14,6 +14,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tests.scenarios.crowd import Crowd
 from tests.scenarios.flight import HOPS, Flight
 
 _BLUE, _GREY, _RED = "#1a6bb5", "#999999", "#c8501e"
@@ -36,10 +37,6 @@ def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios
     directory.mkdir(parents=True, exist_ok=True)
     figures = {title: summary(flight) for title, flight in flights.items()}
     (directory / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        undefined=jinja2.StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
     page = directory / f"{name}.html"
     pictures = {title: _pictures(flight) for title, flight in flights.items()}
     hops = {
@@ -47,11 +44,57 @@ def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios
         for title, flight in flights.items()
     }
     page.write_text(
-        environment.get_template("report.html.j2").render(
-            figures=figures, pictures=pictures, hops=hops, how=how, degrees=math.degrees
-        )
+        _environment()
+        .get_template("report.html.j2")
+        .render(figures=figures, pictures=pictures, hops=hops, how=how, degrees=math.degrees)
     )
     return page
+
+
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        undefined=jinja2.StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+
+
+CROWD = (
+    "Each loop's control is spread over four robots, or over two, 100 Hz; all robots are in one 802.11 ad hoc cell, "
+    "namespaces of one guest in virtual time, whose one processor executes 1000 million instructions a second. The "
+    "simulated radio has neither air time nor collisions: the curve is what computers and network software cost, which "
+    "share that processor here and have one each in the field, and not what a busy channel costs."
+)
+
+
+def write_crowds(crowds: Sequence[Crowd], directory: Path) -> Path:
+    """Latency and loss by the number of robots; the path of the page."""
+    directory.mkdir(parents=True, exist_ok=True)
+    found = [
+        {"robots": crowd.robots, "loops": crowd.loops, "steps": crowd.steps, "lost": crowd.lost,
+         "latency_us": crowd.latency.model_dump(mode="json")} for crowd in crowds
+    ]  # fmt: skip
+    (directory / "robots.json").write_text(json.dumps(found, indent=1) + "\n")
+    page = directory / "robots.html"
+    page.write_text(
+        _environment().get_template("crowd.html.j2").render(crowds=found, picture=_curve(crowds), how=CROWD)
+    )
+    return page
+
+
+def _curve(crowds: Sequence[Crowd]) -> str:
+    figure = Figure(_SIZE, layout="constrained")
+    axes = figure.add_subplot()
+    robots = [crowd.robots for crowd in crowds]
+    for name, percent, color in (("median", "50", _BLUE), ("99.9 %", "99.9", "black"), ("max", "100", _GREY)):
+        values = [crowd.latency.percentiles_us[percent] / 1000 for crowd in crowds]
+        axes.plot(robots, values, color=color, marker="o", markersize=3, linewidth=0.8, label=name)
+    axes.axhline(10, color=_RED, linewidth=0.8)
+    axes.set(title="Four hops: the line is the period", xlabel="robots", ylabel="ms", xticks=robots, ylim=(0, None))
+    axes.legend(loc="upper left")
+    lost = axes.twinx()
+    lost.plot(robots, [100 * crowd.lost / crowd.steps for crowd in crowds], color=_RED, marker="x", linewidth=0)
+    lost.set(ylabel="lost, % (×)", ylim=(0, None))
+    return _drawn(figure)
 
 
 def summary(flight: Flight) -> dict[str, object]:
@@ -87,6 +130,10 @@ def _pictures(flight: Flight) -> list[str]:
 def _svg(flight: Flight, draw: Callable[[Flight, Axes], None]) -> str:
     figure = Figure(_SIZE, layout="constrained")
     draw(flight, figure.add_subplot())
+    return _drawn(figure)
+
+
+def _drawn(figure: Figure) -> str:
     out = io.StringIO()
     figure.savefig(out, format="svg", metadata={"Date": None}, transparent=True)
     return re.sub(r"(?s)^.*?(?=<svg)", "", out.getvalue())

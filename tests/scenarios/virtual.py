@@ -148,6 +148,12 @@ def _streams(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> di
     }
 
 
+def station(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> bytes:
+    """The station's task, for robots that have brought these files."""
+    controllers = described.robots_with("control")
+    return _own("station.yml.j2", controllers=controllers, **_streams(described, brought))
+
+
 def _receivers(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> list[str]:
     """Where control tasks receive datagrams, and of what length: `address:port:length`."""
     return [
@@ -182,19 +188,18 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
             robot_address=flying.address,
             gyro=gyro_device(described, board),
         ),
-        f"{directory}/station.yml": _own(
-            "station.yml.j2", controllers=described.robots_with("control"), **_streams(described, brought)
-        ),
+        f"{directory}/station.yml": station(described, brought),
     }
     tasks = [
         {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
         {"name": "plant", "computer": STATION, "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
     ]
     if plan.second_station:
-        there[f"{directory}/{SECOND}.yml"] = _own("second.yml.j2", robot_address=flying.address)
+        # A file is its task's lock: two computers of one guest need two.
+        there[f"{directory}/{SECOND}.yml"] = there[f"{directory}/station.yml"]
+        there[f"{directory}/{SECOND}-igps.yml"] = _own("second.yml.j2", robot_address=flying.address)
         tasks += [
-            {"name": SECOND, "computer": SECOND, "file": f"{directory}/station.yml"},
-            {"name": f"{SECOND}-igps", "computer": SECOND, "file": f"{directory}/{SECOND}.yml"},
+            {"name": name, "computer": SECOND, "file": f"{directory}/{name}.yml"} for name in (SECOND, f"{SECOND}-igps")
         ]
     for robot in described.robots.values():
         configuration = f"{directory}/{robot.name}-cyclonedds.xml"
@@ -219,43 +224,66 @@ def gyro_device(described: Fleet, board: Board) -> str:
 def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
     """What enters the guest: by path."""
     described = fleet("udp")
-    flying = described.robot_with("valves")
-    cell = f"{DIRECTORY}/ibss.conf"
     there = {
         f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
-        **{f"{DIRECTORY}/{name}": (HERE / name).read_bytes() for name in ("fly.py", "stranger.py")},
-        cell: _rendered(described, keys)[flying.name]["/etc/flotilla/ibss.conf"],
+        f"{DIRECTORY}/stranger.py": (HERE / "stranger.py").read_bytes(),
     }
     flights = []
     for plan in plans:
         flight, brought = _flight(plan, board, keys)
         flights.append(flight)
         there |= brought
+    stranger = Host(name=STRANGER, address=described.network.subnet.broadcast_address - 2)
+    hosts = [*described.robots.values(), *described.stations, second(described), stranger]
+    links = {"/dev/robot/gyro": gyro_device(described, board)}
+    return there | session(described, hosts, flights, keys, links, [f"{DIRECTORY}/{plans[0].name}/valves.yml"])
+
+
+def session(
+    described: Fleet,
+    hosts: Sequence[Host],
+    flights: Sequence[Mapping[str, Any]],
+    keys: Path,
+    links: Mapping[str, str],
+    safe: Sequence[str],
+) -> dict[str, bytes]:
+    """fly.py and what it reads: flights of these computers in the fleet's cell."""
+    cell = f"{DIRECTORY}/ibss.conf"
     length = described.network.subnet.prefixlen
-    hosts = [*described.robots.values(), *described.stations, second(described)]
-    addresses = {host.name: str(host.address) for host in hosts}
-    addresses[STRANGER] = str(described.network.subnet.broadcast_address - 2)
-    session = {
-        "computers": [{"name": name, "address": f"{address}/{length}"} for name, address in addresses.items()],
-        "links": {"/dev/robot/gyro": gyro_device(described, board), "/etc/flotilla/ibss.conf": cell},
-        "safe": [f"{DIRECTORY}/{plans[0].name}/valves.yml"],
+    document = {
+        "computers": [{"name": host.name, "address": f"{host.address}/{length}"} for host in hosts],
+        "links": {**links, "/etc/flotilla/ibss.conf": cell},
+        "safe": safe,
         "flights": flights,
     }
-    return there | {f"{DIRECTORY}/session.json": json.dumps(session, sort_keys=True).encode()}
+    return {
+        f"{DIRECTORY}/fly.py": (HERE / "fly.py").read_bytes(),
+        cell: _rendered(described, keys)[described.robot_with("valves").name]["/etc/flotilla/ibss.conf"],
+        f"{DIRECTORY}/session.json": json.dumps(document, sort_keys=True).encode(),
+    }
 
 
 def fly(plans: Sequence[Plan], board: Board, out: Path) -> dict[str, Path]:
     """Fly one after the other in one guest; where each left what recorders and tasks wrote, a folder for each task."""
-    out.mkdir(parents=True, exist_ok=True)
+    keys = out / "keys"
+    keys.mkdir(parents=True, exist_ok=True)
+    flights = run(files(plans, board, keys), board, out, sum(plan.seconds for plan in plans))
+    return {plan.name: flights / plan.name for plan in plans}
+
+
+def run(there: Mapping[str, bytes], board: Board, out: Path, seconds: float, shift: int = 3) -> Path:
+    """Have a guest run the session of session.json among these files; the folder that has one for each flight.
+
+    An instruction takes 2**`shift` ns.
+    """
     measured = subject.build(board)
     board = board.model_copy(update={"qemu": board.qemu.model_copy(update={"memory_mib": MEMORY_MIB})})
     initrd = out / "initrd.img"
     commands = {"session": ["python3", f"{DIRECTORY}/fly.py", f"{DIRECTORY}/session.json"]}
-    keys = out / "keys"
-    keys.mkdir(exist_ok=True)
-    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, files(plans, board, keys))
-    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=RELAYS)
-    seconds = sum(plan.seconds for plan in plans)
+    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, dict(there))
+    guest = machine.Machine(
+        machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=RELAYS, shift=shift
+    )
     document = results.received(guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds))
     initrd.unlink()
     said = json.loads(document["commands"]["session"])
@@ -265,4 +293,4 @@ def fly(plans: Sequence[Plan], board: Board, out: Path) -> dict[str, Path]:
         file.write_bytes(base64.b64decode(content))
     if "error" in said:
         raise UserError(f"the flight failed in the guest:\n{said['error'].strip()}")
-    return {plan.name: out / "flights" / plan.name for plan in plans}
+    return out / "flights"
