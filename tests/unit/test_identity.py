@@ -118,6 +118,18 @@ def test_a_robot_that_stands_by_is_sent_to_and_listened_to() -> None:
         rendered("udp", "control", {"robot4": "navigation"})
 
 
+def test_stations_hear_all_and_the_first_says_where_the_robot_is() -> None:
+    """Seen to fail when a stream was looked for by one address."""
+    flying = virtual.fleet("udp", second_station=True)
+    sensors, valves = (
+        yaml.safe_load(identity.control_tasks(flying, flying.robot_with(task))[task])["blocks"]
+        for task in ("sensors", "valves")
+    )
+    both = ["170.160.1.254", "170.160.1.252"]
+    assert sensors["igps"]["parameters"]["from"] == valves["to_station"]["parameters"]["address"] == both
+    assert {stream.port for stream in telemetry.streams(flying)} == {5020, 5021}
+
+
 def test_every_port_in_use_gets_its_name_and_baud_rate(fleet: Fleet) -> None:
     rules = _text(fleet, fleet.robots[1], "/etc/udev/rules.d/70-robot.rules")
     for name, device in fleet.robots[1].devices.items():
