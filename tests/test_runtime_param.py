@@ -9,6 +9,7 @@ import signal
 import socket
 import stat
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,8 +25,9 @@ blocks:
   trigger: {{type: schmitt-trigger, in: {{in: a.out}}, parameters: {{on: 3, off: {off}}}}}
   camera: {{type: image-processor, in: {{image: {image}, flag: 1, sequence: 1}},
            parameters: {{width: 2, height: 1, threshold: {threshold}}}}}
+{more}
 """
-USUAL = {"period": "10 ms", "max": "1", "off": "1", "image": "[0, 0]", "threshold": "100"}
+USUAL = {"period": "10 ms", "max": "1", "off": "1", "image": "[0, 0]", "threshold": "100", "more": ""}
 SECONDS = 30
 """Time limit of what takes none."""
 
@@ -51,6 +53,14 @@ class Running:
     def param(self, *words: str) -> subprocess.CompletedProcess[str]:
         argv = [str(self.program.with_name("flotilla-param")), "--control", str(self.control), "task", *words]
         return subprocess.run(argv, capture_output=True, text=True, timeout=SECONDS, check=False)
+
+    def status(self, *more: str) -> subprocess.CompletedProcess[str]:
+        argv = [str(self.program.with_name("flotilla-param")), "--control", str(self.control), *more, "task"]
+        return subprocess.run(argv, capture_output=True, text=True, timeout=SECONDS, check=False)
+
+    def told(self) -> dict[str, Any]:
+        told: dict[str, Any] = json.loads(self.status("--status=json").stdout)
+        return told
 
     def connected(self) -> socket.socket:
         connection = socket.socket(socket.AF_UNIX)
@@ -169,11 +179,15 @@ def test_no_such_task(flotilla_run: Path, tmp_path: Path) -> None:
     assert done.stderr == f"flotilla-param: no task heading runs here: nobody listens at {tmp_path}/control\n"
 
 
-@pytest.mark.parametrize("request_", [b"set\n", b"\n", b"set a.factor\n", b"list all\n", b"get a.factor 1\n"])
+@pytest.mark.parametrize(
+    "request_", [b"set\n", b"\n", b"set a.factor\n", b"list all\n", b"get a.factor 1\n", b"status xml\n"]
+)
 def test_a_wrong_request_is_answered(start: Start, request_: bytes) -> None:
     with start().connected() as client:
         client.sendall(request_)
-        assert client.makefile().read() == "error\nthere is: list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE\n"
+        assert client.makefile().read() == (
+            "error\nthere is: list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, status json\n"
+        )
 
 
 RUDE = {"silent": b"", "half a line": b"set a.fac", "endless": b"x" * 100_000, "no text": b"set a.factor \0\n"}
@@ -240,3 +254,46 @@ def test_anothers_socket_and_what_is_none_stay(start: Start, tmp_path: Path) -> 
         assert f"{path}: it is there already, and is another task's or no socket" in refused.stderr
     assert file.read_text() == "mine"
     assert running.param("a.factor").stdout == "2\n"
+
+
+def test_a_task_says_how_it_does(start: Start) -> None:
+    """Stopped for 20 periods it overruns; a sensor is heard. Seen to fail where the control thread tells nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        address = free.getsockname()
+    running = start(
+        more=f"  heard: {{type: udp-receive, parameters: {{port: {address[1]}, length: 1, timeout: 3600}}}}"
+    )
+    end = time.monotonic() + SECONDS
+    while not (told := running.told())["steps"]:
+        assert time.monotonic() < end
+    assert (told["task"], told["period_s"], told["timeouts"]) == ("task", 0.01, 0)
+    assert told["sensors"].keys() == {"camera", "heard"}
+    assert told["sensors"]["heard"]["flag"] is False
+    before = told["overruns"]
+    running.process.send_signal(signal.SIGSTOP)
+    time.sleep(0.2)
+    running.process.send_signal(signal.SIGCONT)
+    while (told := running.told())["overruns"] == before:
+        assert time.monotonic() < end
+    assert told["skipped"] >= 18
+    assert 0 <= told["last_overrun"]["ago_s"] < told["running_s"]
+    assert 0 <= told["last_overrun"]["step"] < told["steps"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.sendto(b"1", address)
+    while not (sensor := running.told()["sensors"]["heard"])["flag"]:
+        assert time.monotonic() < end
+    assert 0 <= sensor["age_s"] < SECONDS
+    lines = running.status("--status").stdout
+    assert re.search(
+        r"^overruns: \d+, \d+ releases skipped; the last [\d.]+ s ago: step \d+ ended [\d.]+ s late$", lines, re.M
+    )
+    assert re.search(r"^heard: flag 1, age [\d.]+ s$", lines, re.M)
+
+
+def test_a_wrong_wish_for_status_is_said(start: Start) -> None:
+    running = start()
+    refused = running.status("--status=xml")
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr == "flotilla-param: --status=xml: there is --status and --status=json\n"
+    assert running.status("--status", "other").returncode == 2

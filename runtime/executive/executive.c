@@ -4,6 +4,7 @@
 #include "block.h"
 #include "privilege.h"
 #include "schedule.h"
+#include "status.h"
 #include "watch.h"
 
 #include <errno.h>
@@ -37,7 +38,7 @@ struct executive {
     pthread_t control;
     int ended_fd;
     _Atomic bool stop, ended;
-    _Atomic uint64_t heartbeat; /* steps done, for the watching thread */
+    struct status *status; /* for all other threads */
 };
 
 /* --- life of blocks --- */
@@ -164,11 +165,12 @@ static int64_t next_release(struct executive *executive, int64_t expected_ns, in
     }
     char text[128];
     result->overruns++;
+    result->last_overrun = (struct overrun_of_step){result->steps - 1, now_ns, now_ns - next_ns};
     ++*in_a_row;
     if (task->overrun == OVERRUN_STOP_SAFE || (task->overruns && *in_a_row >= task->overruns)) {
         snprintf(text, sizeof text,
-                 "step %" PRIu64 " ended %" PRId64 " us after the next was due, %" PRId64 " in a row", result->steps,
-                 (now_ns - next_ns) / 1000, *in_a_row);
+                 "step %" PRIu64 " ended %" PRId64 " us after the next was due, %" PRId64 " in a row",
+                 result->last_overrun.step, result->last_overrun.late_ns / 1000, *in_a_row);
         end(result, ENDING_OVERRUN, NULL, text);
     }
     int64_t behind = (now_ns - next_ns) / task->period_ns + 1;
@@ -200,7 +202,6 @@ static void *control(void *argument)
         else if (executive->watch)
             watch_put(executive->watch, result->steps, release_ns, options->no_wait);
         result->steps++;
-        atomic_store_explicit(&executive->heartbeat, result->steps, memory_order_release);
         if (failed)
             break;
         if (executive->change)
@@ -208,6 +209,7 @@ static void *control(void *argument)
         if (result->steps == options->steps)
             end(result, ENDING_ASKED, NULL, "all steps are done");
         expected_ns = next_release(executive, expected_ns, release_ns, now_ns, &in_a_row);
+        status_put(executive->status, result);
         if (result->ending != ENDING_NONE)
             break;
     }
@@ -224,7 +226,7 @@ static void abandon(struct executive *executive)
 {
     char text[128];
     snprintf(text, sizeof text, "no step for ten periods and a second, after step %" PRIu64,
-             atomic_load(&executive->heartbeat));
+             status_steps(executive->status));
     make_outputs_safe(executive->task);
     /* Others have to run for what follows, and the thread may be all that does. */
     pthread_setschedparam(executive->control, SCHED_OTHER, &(struct sched_param){0});
@@ -243,7 +245,7 @@ static void *guard(void *argument)
     struct pollfd ended = {.fd = executive->ended_fd, .events = POLLIN};
     while (poll(&ended, 1, (int)(patience_ns / 2 / 1000000)) <= 0) {
         now_ns = fl_now_ns();
-        steps = atomic_load_explicit(&executive->heartbeat, memory_order_acquire);
+        steps = status_steps(executive->status);
         if (steps != last)
             moved_ns = now_ns;
         last = steps;
@@ -274,7 +276,7 @@ static void serve(struct executive *executive, int signals_fd)
                 atomic_store(&executive->stop, true);
         }
         int64_t now_ns = fl_now_ns();
-        uint64_t steps = atomic_load_explicit(&executive->heartbeat, memory_order_acquire);
+        uint64_t steps = status_steps(executive->status);
         /* Only a task that steps may say that it is alive. */
         if (guarded && (steps != last || period_ns > now_ns - moved_ns) && now_ns - notified_ns >= interval_ns) {
             sd_notify(0, "WATCHDOG=1");
@@ -299,7 +301,7 @@ static int block_signals(void)
 
 static void serve_parameters(const struct executive *executive)
 {
-    int error = executive->options->tuner ? tuner_start(executive->options->tuner) : 0;
+    int error = executive->options->tuner ? tuner_start(executive->options->tuner, executive->status) : 0;
     if (error)
         fprintf(stderr, "flotilla: %s: no thread for parameters (%s): they stay as they are\n", executive->task->name,
                 strerror(error));
@@ -339,6 +341,7 @@ void executive_run(struct task *task, const struct run_options *options, struct 
     for (size_t i = 0; i < task->count; i++)
         task->members[i].block->service->priority = priority ? priority - 1 : 0;
     if (start_blocks(task, result)) {
+        executive.status = status_create(task);
         int error = start_threads(&executive, priority, &guarding);
         if (error) {
             end(result, ENDING_FAILED, NULL, strerror(error));
@@ -359,6 +362,7 @@ void executive_run(struct task *task, const struct run_options *options, struct 
     terminate_blocks(task);
     schedule_report(executive.schedule, task);
     schedule_destroy(executive.schedule);
+    status_destroy(executive.status);
     watch_destroy(executive.watch);
     close(executive.ended_fd);
     close(signals_fd);

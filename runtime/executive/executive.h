@@ -41,10 +41,14 @@ struct run_result {
     enum ending ending;
     char reason[320];
     uint64_t steps, overruns;
-    uint64_t skipped;         /* releases that were left out */
-    uint64_t timeouts;        /* steps for which the trigger had nothing */
-    struct statistics jitter; /* from a step's release to its begin */
-    struct statistics step;   /* from begin to end */
+    uint64_t skipped; /* releases that were left out */
+    struct overrun_of_step {
+        uint64_t step;
+        int64_t at_ns, late_ns; /* when it ended, CLOCK_MONOTONIC, and how long after the next was due */
+    } last_overrun;             /* where there were overruns */
+    uint64_t timeouts;          /* steps for which the trigger had nothing */
+    struct statistics jitter;   /* from a step's release to its begin */
+    struct statistics step;     /* from begin to end */
 };
 
 /* Run until it ends; the blocks are terminated and the result is complete then. Messages go to stderr. */

@@ -1,4 +1,5 @@
-/* flotilla-param: reads and sets parameters of a task that runs, through the socket that tuner.h describes. */
+/* flotilla-param: reads and sets parameters of a task that runs, and asks how it does, through the socket that tuner.h
+ * describes. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <getopt.h>
@@ -16,16 +17,18 @@ static const char usage[] =
     "usage: flotilla-param [OPTION]... TASK [BLOCK.PARAMETER [VALUE]]\n"
     "List the parameters of a task that runs here, print one of them, or set it between two steps.\n"
     "\n"
+    "  --status[=json] how the task does instead: steps, overruns, flags and ages of its sensors\n"
     "  --control PATH  the task's socket (default: /run/flotilla/TASK/control)\n"
     "  --help, --version\n"
     "\n"
     "Status: 0 done, 1 refused, or no such task runs, 2 the command line is wrong.\n";
 
 enum { ANSWER_MS = 30 * 1000 };
-enum { CONTROL = 1, HELP, VERSION };
+enum { CONTROL = 1, STATUS, HELP, VERSION };
 
 static const struct option options[] = {
     {"control", required_argument, NULL, CONTROL},
+    {"status", optional_argument, NULL, STATUS},
     {"help", no_argument, NULL, HELP},
     {"version", no_argument, NULL, VERSION},
     {0},
@@ -92,12 +95,12 @@ static int ask(const char *task, const char *path, const char *request, size_t l
 }
 
 /* The request as tuner.h has it; false when a word would break its line. */
-static bool write_request(char **request, size_t *length, char **words, int count)
+static bool write_request(char **request, size_t *length, const char *verb, char **words, int count)
 {
     FILE *out = open_memstream(request, length);
     if (!out)
         abort();
-    fputs(count == 0 ? "list" : count == 1 ? "get" : "set", out);
+    fputs(verb, out);
     for (int i = 0; i < count; i++)
         fprintf(out, " %s", words[i]);
     bool good = (count == 0 || !strpbrk(words[0], " \n")) && (count < 2 || !strchr(words[1], '\n'));
@@ -107,7 +110,8 @@ static bool write_request(char **request, size_t *length, char **words, int coun
 
 int main(int argc, char **argv)
 {
-    const char *path = NULL;
+    static const char *const verbs[] = {"list", "get", "set"}; /* by the number of words */
+    const char *path = NULL, *status = NULL;
     char usual[PATH_MAX], *request;
     size_t length;
     for (int option; (option = getopt_long(argc, argv, "+", options, NULL)) != -1;) { /* a value may begin with - */
@@ -115,6 +119,12 @@ int main(int argc, char **argv)
         case CONTROL:
             path = optarg;
             break;
+        case STATUS:
+            status = !optarg ? "status" : strcmp(optarg, "json") == 0 ? "status json" : NULL;
+            if (status)
+                break;
+            fprintf(stderr, "flotilla-param: --status=%s: there is --status and --status=json\n", optarg);
+            return 2;
         case HELP:
             fputs(usage, stdout);
             return 0;
@@ -127,13 +137,13 @@ int main(int argc, char **argv)
         }
     }
     int words = argc - optind;
-    if (words < 1 || words > 3 || strchr(argv[optind], '/') ||
-        !write_request(&request, &length, argv + optind + 1, words - 1)) {
+    if (words < 1 || words > (status ? 1 : 3) || strchr(argv[optind], '/') ||
+        !write_request(&request, &length, status ? status : verbs[words - 1], argv + optind + 1, words - 1)) {
         fputs(usage, stderr);
         return 2;
     }
     snprintf(usual, sizeof usual, "/run/flotilla/%s/control", argv[optind]);
-    int status = ask(argv[optind], path ? path : usual, request, length);
+    int done = ask(argv[optind], path ? path : usual, request, length);
     free(request);
-    return status;
+    return done;
 }

@@ -21,7 +21,7 @@ static const char usage[] =
     "  --no-wait           do not wait for releases: time is counted, not measured\n"
     "  --watch SIGNALS     print block.port,block.port[2],... each step, a line of JSON each\n"
     "  --statistics FILE   write times, jitter and overruns as JSON at the end\n"
-    "  --control PATH      socket at which flotilla-param reads and sets parameters\n"
+    "  --control PATH      socket for flotilla-param: parameters, how the task does\n"
     "                      (default: control in $RUNTIME_DIRECTORY, as a service has one; otherwise none)\n"
     "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS "); several are separated by ':'\n"
     "  --help, --version\n"

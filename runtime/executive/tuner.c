@@ -2,6 +2,7 @@
 #include "tuner.h"
 
 #include "block.h"
+#include "status.h"
 
 #include <errno.h>
 #include <inttypes.h>
@@ -29,6 +30,7 @@ enum {
 struct tuner {
     struct change change;
     struct task *task;
+    const struct status *status;
     char *path;
     int listen_fd, stop_fd;
     bool started;
@@ -220,6 +222,12 @@ static bool set(struct tuner *tuner, struct client *client, char *name, const ch
     return true;
 }
 
+static bool tell_status(const struct tuner *tuner, struct client *client, bool json)
+{
+    status_write(tuner->status, json, client->answer);
+    return true;
+}
+
 static bool obey(struct tuner *tuner, struct client *client)
 {
     char *rest = client->request, *verb = strsep(&rest, " "), *name = strsep(&rest, " ");
@@ -229,7 +237,9 @@ static bool obey(struct tuner *tuner, struct client *client)
         return get(tuner, client, name);
     if (strcmp(verb, "set") == 0 && name && rest)
         return set(tuner, client, name, rest);
-    return refuse(client, "there is: list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE");
+    if (strcmp(verb, "status") == 0 && (!name || (strcmp(name, "json") == 0 && !rest)))
+        return tell_status(tuner, client, name);
+    return refuse(client, "there is: list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, status json");
 }
 
 /* --- clients --- */
@@ -382,9 +392,10 @@ void tuner_destroy(struct tuner *tuner)
     free(tuner);
 }
 
-int tuner_start(struct tuner *tuner)
+int tuner_start(struct tuner *tuner, const struct status *status)
 {
     struct fl_service ordinary = {0};
+    tuner->status = status;
     int error = fl_service_thread(&ordinary, &tuner->thread, "tuner", serve, tuner);
     tuner->started = !error;
     return error;

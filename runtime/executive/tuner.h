@@ -1,10 +1,13 @@
-/* Parameters of a running task, read and set through a Unix stream socket, of which flotilla-param is the other end.
+/* A running task's parameters, read and set, and how it does, through a Unix stream socket, of which flotilla-param is
+ * the other end.
  *
  * A connection carries one request, a line of text:
  *
  *     list                           all parameters
  *     get BLOCK.PARAMETER
  *     set BLOCK.PARAMETER VALUE      as a task file writes it; only what is tunable (FL_TUNABLE)
+ *     status                         steps, overruns, sensors' flags: lines for people
+ *     status json                    the same, as status.h describes it
  *
  * and its answer, until the task closes it: "ok" on a line and what was asked for on the following ones, or "error",
  * with the reason on the next line. A value is judged as in a task file, together with the block's other ones, taken
@@ -18,6 +21,7 @@
 #include "change.h"
 #include "task.h"
 
+struct status;
 struct tuner;
 
 /* Listen at `path`, for the user of this process alone. A socket that a killed task left behind is replaced. NULL after
@@ -27,8 +31,9 @@ struct tuner *tuner_create(const char *path, struct task *task);
 /* Close and remove the socket. NULL is allowed. */
 void tuner_destroy(struct tuner *tuner);
 
-/* Start serving. 0 or an errno. From then on the control thread takes what is offered in tuner_change(). */
-int tuner_start(struct tuner *tuner);
+/* Start serving; `status` is the task's. 0 or an errno. From then on the control thread takes what is offered in
+ * tuner_change(). */
+int tuner_start(struct tuner *tuner, const struct status *status);
 struct change *tuner_change(struct tuner *tuner);
 
 /* End serving; nothing that a client does delays it. */

@@ -1,0 +1,175 @@
+#include "status.h"
+
+#include <flotilla/sensor.h>
+#include <inttypes.h>
+#include <sched.h>
+#include <stdatomic.h>
+#include <stdlib.h>
+#include <string.h>
+
+struct sensor {
+    const char *name;
+    const bool *flag; /* the block's outputs */
+    const double *age;
+    _Atomic bool put_flag;
+    _Atomic float put_age; /* four bytes are written at once by every processor */
+};
+
+/* A sequence lock: `turn` is odd while the control thread writes. All it writes has release order, so that whoever
+ * reads any of it also sees that turn. */
+struct status {
+    _Alignas(64) _Atomic uint32_t turn;
+    _Atomic uint64_t steps, overruns, skipped, timeouts, overrun_step;
+    _Atomic int64_t overrun_ns, late_ns;
+    const struct task *task;
+    int64_t begun_ns;
+    size_t count;
+    struct sensor sensors[];
+};
+
+struct reading {
+    uint64_t steps, overruns, skipped, timeouts, overrun_step;
+    int64_t overrun_ns, late_ns;
+    struct {
+        bool flag;
+        float age;
+    } sensors[];
+};
+
+#define PUT(member, value) atomic_store_explicit(&(member), (value), memory_order_release)
+#define GET(member)        atomic_load_explicit(&(member), memory_order_acquire)
+
+/* Number of the first of the three outputs; -1: it is no sensor. */
+static int sensor_port(const struct fl_block *block)
+{
+    static const struct fl_port wanted[] = {FL_SENSOR_OUTPUTS};
+    enum { WANTED = sizeof wanted / sizeof *wanted };
+    for (uint32_t first = 0; first + WANTED <= block->out_count; first++) {
+        const struct fl_port *there = &block->out_ports[first];
+        uint32_t same = 0;
+        while (same < WANTED && strcmp(there[same].name, wanted[same].name) == 0 &&
+               there[same].type == wanted[same].type && there[same].width == wanted[same].width)
+            same++;
+        if (same == WANTED)
+            return (int)first;
+    }
+    return -1;
+}
+
+struct status *status_create(const struct task *task)
+{
+    size_t bytes = sizeof(struct status) + task->count * sizeof(struct sensor);
+    struct status *status = aligned_alloc(64, (bytes + 63) / 64 * 64);
+    if (!status)
+        abort();
+    memset(status, 0, bytes);
+    status->task = task;
+    status->begun_ns = fl_now_ns();
+    for (size_t i = 0; i < task->count; i++) {
+        const struct fl_block *block = task->members[i].block;
+        int port = sensor_port(block);
+        if (port >= 0)
+            status->sensors[status->count++] =
+                (struct sensor){.name = block->name, .flag = block->out[port], .age = block->out[port + 1]};
+    }
+    return status;
+}
+
+void status_destroy(struct status *status)
+{
+    free(status);
+}
+
+void status_put(struct status *status, const struct run_result *result)
+{
+    uint32_t turn = atomic_load_explicit(&status->turn, memory_order_relaxed);
+    atomic_store_explicit(&status->turn, turn + 1, memory_order_relaxed);
+    PUT(status->steps, result->steps);
+    PUT(status->timeouts, result->timeouts);
+    if (result->overruns != atomic_load_explicit(&status->overruns, memory_order_relaxed)) {
+        PUT(status->overruns, result->overruns);
+        PUT(status->skipped, result->skipped);
+        PUT(status->overrun_step, result->last_overrun.step);
+        PUT(status->overrun_ns, result->last_overrun.at_ns);
+        PUT(status->late_ns, result->last_overrun.late_ns);
+    }
+    for (struct sensor *sensor = status->sensors, *end = sensor + status->count; sensor < end; sensor++) {
+        PUT(sensor->put_flag, *sensor->flag);
+        PUT(sensor->put_age, (float)*sensor->age);
+    }
+    PUT(status->turn, turn + 2);
+}
+
+uint64_t status_steps(const struct status *status)
+{
+    return GET(status->steps);
+}
+
+/* To be freed. Again whenever the control thread wrote meanwhile: it does for well under a microsecond of each period.
+ */
+static struct reading *read_status(const struct status *status)
+{
+    struct reading *reading = calloc(1, sizeof *reading + status->count * sizeof reading->sensors[0]);
+    if (!reading)
+        abort();
+    for (;; sched_yield()) {
+        uint32_t turn = GET(status->turn);
+        reading->steps = GET(status->steps);
+        reading->overruns = GET(status->overruns);
+        reading->skipped = GET(status->skipped);
+        reading->timeouts = GET(status->timeouts);
+        reading->overrun_step = GET(status->overrun_step);
+        reading->overrun_ns = GET(status->overrun_ns);
+        reading->late_ns = GET(status->late_ns);
+        for (size_t i = 0; i < status->count; i++) {
+            reading->sensors[i].flag = GET(status->sensors[i].put_flag);
+            reading->sensors[i].age = GET(status->sensors[i].put_age);
+        }
+        if (turn % 2 == 0 && turn == atomic_load_explicit(&status->turn, memory_order_relaxed))
+            return reading;
+    }
+}
+
+static double seconds(int64_t ns)
+{
+    return (double)ns / 1e9;
+}
+
+static void write_json(const struct status *status, const struct reading *reading, int64_t now_ns, FILE *out)
+{
+    fprintf(out, "{\"task\": \"%s\", \"period_s\": %g, \"running_s\": %.3f, \"steps\": %" PRIu64, status->task->name,
+            seconds(status->task->period_ns), seconds(now_ns - status->begun_ns), reading->steps);
+    fprintf(out, ", \"overruns\": %" PRIu64 ", \"skipped\": %" PRIu64 ", \"timeouts\": %" PRIu64 ", \"last_overrun\": ",
+            reading->overruns, reading->skipped, reading->timeouts);
+    if (reading->overruns)
+        fprintf(out, "{\"step\": %" PRIu64 ", \"ago_s\": %.3f, \"late_s\": %.9f}", reading->overrun_step,
+                seconds(now_ns - reading->overrun_ns), seconds(reading->late_ns));
+    else
+        fputs("null", out);
+    fputs(", \"sensors\": {", out);
+    for (size_t i = 0; i < status->count; i++)
+        fprintf(out, "%s\"%s\": {\"flag\": %s, \"age_s\": %.6f}", i ? ", " : "", status->sensors[i].name,
+                reading->sensors[i].flag ? "true" : "false", (double)reading->sensors[i].age);
+    fputs("}}\n", out);
+}
+
+static void write_text(const struct status *status, const struct reading *reading, int64_t now_ns, FILE *out)
+{
+    fprintf(out, "period: %g s\nrunning: %.3f s\nsteps: %" PRIu64 "\n", seconds(status->task->period_ns),
+            seconds(now_ns - status->begun_ns), reading->steps);
+    fprintf(out, "overruns: %" PRIu64 ", %" PRIu64 " releases skipped", reading->overruns, reading->skipped);
+    if (reading->overruns)
+        fprintf(out, "; the last %.3f s ago: step %" PRIu64 " ended %.6f s late", seconds(now_ns - reading->overrun_ns),
+                reading->overrun_step, seconds(reading->late_ns));
+    fprintf(out, "\ntimeouts: %" PRIu64 "\n", reading->timeouts);
+    for (size_t i = 0; i < status->count; i++)
+        fprintf(out, "%s: flag %d, age %.3f s\n", status->sensors[i].name, reading->sensors[i].flag,
+                (double)reading->sensors[i].age);
+}
+
+void status_write(const struct status *status, bool json, FILE *out)
+{
+    struct reading *reading = read_status(status);
+    (json ? write_json : write_text)(status, reading, fl_now_ns(), out);
+    free(reading);
+}
