@@ -20,6 +20,7 @@ import signal
 import socket
 import stat
 import subprocess
+import time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # without an import: it takes time
@@ -29,6 +30,10 @@ if TYPE_CHECKING:  # without an import: it takes time
 ARGUMENTS = r"""<<INCLUDE_ANSIBLE_MODULE_JSON_ARGS>>"""
 LAYER = "/data/etc"
 SHOWN_BYTES = 65536
+LOOKED_AT_S = 1.0
+"""At least, for overruns to show."""
+PATIENCE_S = 10.0
+"""For required sensors of a task that has just started."""
 UNIT_PROPERTIES = "Id,Type,ActiveState,SubState,Result,ConditionResult,RemainAfterExit,NRestarts,UnitFileState"
 
 
@@ -211,17 +216,59 @@ def clock() -> dict[str, Any]:
     return {"synchronised": fields[13] != "Not synchronised", "offset_s": float(fields[4])}
 
 
+def status(task: str) -> dict[str, Any]:
+    """How a running task does, as it says itself (runtime/executive/status.h), or the `problem` with that."""
+    argv = ["flotilla-param", "--status=json", task]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    if done.returncode:
+        return {"problem": done.stderr.strip() or f"flotilla-param ended with status {done.returncode}"}
+    told: dict[str, Any] = json.loads(done.stdout)
+    return told
+
+
+class Watch:
+    """Control tasks, from now on until `end`."""
+
+    def __init__(self, tasks: list[str]) -> None:
+        self._begun = time.monotonic()
+        self._before = {task: status(task) for task in tasks}
+
+    def end(self, required: list[str]) -> dict[str, dict[str, Any]]:
+        """How each does, and `lately`, meanwhile. It waits for `required` sensors (TASK.BLOCK) that are not good."""
+        if not self._before:
+            return {}
+        time.sleep(max(0.0, self._begun + LOOKED_AT_S - time.monotonic()))
+        while True:
+            now = {task: status(task) for task in self._before}
+            good = [f"{task}.{name}" for task in now for name, it in now[task].get("sensors", {}).items() if it["flag"]]
+            waiting = [name for name in required if name.split(".")[0] in now and name not in good]
+            if not waiting or time.monotonic() > self._begun + PATIENCE_S:
+                break
+            time.sleep(0.5)
+        return {task: lately(self._before[task], told) for task, told in now.items()}
+
+
+def lately(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """What a task says, and of it what is new; all is where it started anew meanwhile."""
+    if "problem" in now:
+        return now
+    same = before.get("steps", now["steps"] + 1) <= now["steps"]
+    return {**now, "lately": {key: now[key] - (before[key] if same else 0) for key in ("steps", "overruns")}}
+
+
 def main() -> None:
     arguments = json.loads(ARGUMENTS)
     services = units(arguments["control_tasks"])
+    names = {name: re.findall("flotilla-task@(.+)[.]service$", name) for name in services}
+    tasks = {name: task for name, found in names.items() for task in found}
+    watch = Watch([task for name, task in tasks.items() if services[name]["ActiveState"] == "active"])
     interface = json.loads(output("ip", "-json", "-4", "address", "show", "dev", arguments["interface"]) or "[]")
     addresses = [f"{each['local']}/{each['prefixlen']}" for link in interface for each in link.get("addr_info", [])]
     uarts = re.findall(r"^(\d+): uart:(?!unknown)", read("/proc/tty/driver/serial"), re.MULTILINE)
     data = os.statvfs("/data")
-    wanted = {f"flotilla-task@{task}.service" for task in arguments["control_tasks"]}
-    tasks = {name for name in services if name.startswith("flotilla-task@")}
+    wanted = {name for name, task in tasks.items() if task in arguments["control_tasks"]}
     failed = output("systemctl", "list-units", "--state=failed", "--plain", "--no-legend")
-    state = {
+    state: dict[str, Any] = {
         "drift": drift(arguments["expected"], arguments["keep"]),
         "hostname": socket.gethostname(),
         "machine": os.uname().machine,
@@ -233,7 +280,7 @@ def main() -> None:
             name for name, unit in services.items() if not is_up(unit) and (name not in tasks or name in wanted)
         ),
         "superfluous_tasks": sorted(
-            name for name in tasks - wanted if services[name]["ActiveState"] not in ("inactive", "failed")
+            name for name in tasks.keys() - wanted if services[name]["ActiveState"] not in ("inactive", "failed")
         ),
         "failed": [line.split()[0] for line in failed.splitlines()],
         "tasks": {
@@ -243,6 +290,9 @@ def main() -> None:
         "data_free_bytes": data.f_bavail * data.f_frsize,
         "boot_id": read("/proc/sys/kernel/random/boot_id").strip(),
     }
+    told = watch.end(arguments["required_sensors"])
+    for name, task in tasks.items():
+        state["tasks"][name]["status"] = told.get(task)
     print(json.dumps({"changed": False, "state": state}))
 
 

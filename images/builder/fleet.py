@@ -89,6 +89,14 @@ TaskName = Annotated[
         "a small letter, then small letters, digits or hyphens, such as heading: ansible/control_tasks/heading.yml",
     ),
 ]
+SensorName = Annotated[
+    str,
+    _matching(
+        r"[a-z][a-z0-9-]{0,31}\.[A-Za-z0-9_-]+",
+        "is not TASK.BLOCK",
+        "a control task and one of its blocks that have a flag, such as heading.gyro",
+    ),
+]
 Word = Annotated[str, _matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
 Module = Annotated[str, _matching(r"[A-Za-z0-9_]+", "is not a kernel module's name", "such as ata_piix, without .ko")]
 
@@ -252,6 +260,21 @@ class Network(_Model):
     """What carries messages between control tasks of several robots: datagrams, or Cyclone DDS topics."""
 
 
+class Health(_Model):
+    """What a robot's control tasks may say of themselves without ending a roll-out."""
+
+    overruns_percent: Annotated[float, Strict(), _between(0, 100, "100 permits all")] = 1
+    """Steps that overran, of those that a task makes while the robot is looked at."""
+    required_sensors: list[SensorName] = []
+    """Their flags have to be 1, on each robot that has the task. All others' are only shown: a robot flies without
+    some, and one without a cable is no worse than it was."""
+
+    def sensors_of(self, task: str) -> list[str]:
+        """The blocks of a task that are required."""
+        named = (each.split(".", 1) for each in self.required_sensors)
+        return [block for of, block in named if of == task]
+
+
 class Device(_Model):
     """Something plugged into a serial port. Its name becomes `/dev/robot/NAME`."""
 
@@ -283,6 +306,7 @@ class Fleet(_Model):
 
     name: Label
     network: Network
+    health: Health = Health()
     boards: dict[str, Board]
     robots: dict[int, Robot]
     """By number, ascending."""

@@ -29,7 +29,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from images.builder import cache, paths
 from images.builder.errors import Problem, ProblemsError, UserError
-from images.builder.fleet import Board, Fleet, Host, Label, Network, Robot
+from images.builder.fleet import Board, Fleet, Health, Host, Label, Network, Robot
 
 Loc = tuple[str | int, ...]
 """Where a value sits in the merged description: `("robots", "robot3", "address")`."""
@@ -38,7 +38,7 @@ Finding = tuple[Loc, str, str]
 Scope = tuple[str, str]
 """Whose variables, by kind and name: `("hosts", "robot3")`, `("group_vars", "all")`, `("vars", "robots")` …"""
 
-_HOMES = {"fleet_name": "all", "network": "all", "board": "board_*"}
+_HOMES = {"fleet_name": "all", "network": "all", "health": "all", "board": "board_*"}
 """Variables that hosts share, and the one group whose `group_vars/` sets them."""
 _OF_ROBOTS = ("number", "devices", "control_tasks", "standby")
 _VARIABLES = {"address", *_OF_ROBOTS, *_HOMES}
@@ -308,6 +308,7 @@ class _Description(BaseModel):
     model_config = ConfigDict(extra="forbid")
     name: Label
     network: Network
+    health: Health = Health()
     boards: dict[str, Board]
     robots: dict[str, Robot]
     stations: dict[str, Host]
@@ -346,6 +347,7 @@ def validate(merged: dict[str, Any], sources: Sources) -> Fleet:
     return Fleet(
         name=description.name,
         network=description.network,
+        health=description.health,
         boards=description.boards,
         robots={robot.number: robot for robot in robots},
         stations=list(description.stations.values()),
@@ -386,7 +388,7 @@ class _Groups:
                 return [("group_vars", f"board_{board}")], ("board", *rest)
             case ("name",):
                 return [("group_vars", "all")], ("fleet_name",)
-            case ("network", *_):
+            case ("network" | "health", *_):
                 return [("group_vars", "all")], loc
         return [("hosts", "")], loc
 
@@ -398,7 +400,7 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
     boards = sorted({*(name for name in groups.members if name.startswith("board_")), *sources.boards()})
     for host in groups.hosts:
         variables = groups.variables.get(host, {})
-        for key, name in (("fleet_name", "name"), ("network", "network")):
+        for key, name in (("fleet_name", "name"), ("network", "network"), ("health", "health")):
             if key in variables:
                 raw.setdefault(name, variables[key])
         of = groups.of(host)
@@ -454,6 +456,7 @@ def _templates(value: Any, loc: Loc) -> Iterator[Finding]:
 _EXPLANATIONS = {
     "missing": ("is missing", "add it as its neighbours have it"),
     "int_type": ("is not a whole number", "digits without quotes"),
+    "float_type": ("is not a number", "digits without quotes"),
     "string_type": ("is not a text", "put it in quotes"),
     "literal_error": ("is not known", "one of {expected}"),
     "ip_v4_address": ("is not an IPv4 address", "four numbers from 0 to 255, such as 10.42.0.5"),
@@ -590,6 +593,21 @@ def _standby(raw: dict[str, Any]) -> Iterator[Finding]:
                 yield loc, f"no robot has {task} first", "remove it from one robot's standby: that one is listened to"
 
 
+def _required_sensors(raw: dict[str, Any]) -> Iterator[Finding]:
+    health = raw.get("health")
+    required = health.get("required_sensors") if isinstance(health, dict) else None
+    tasks = {task for name in raw["robots"] for task in _named(raw, name, "control_tasks").values()}
+    named = {
+        ("health", "required_sensors", index): sensor
+        for index, sensor in enumerate(required if isinstance(required, list) else ())
+        if isinstance(sensor, str)
+    }
+    for loc, sensor in named.items():
+        if (task := sensor.partition(".")[0]) not in tasks:
+            remedy = f"a sensor of {', '.join(sorted(tasks))}" if tasks else "remove it"
+            yield loc, f"no robot has a control task {task}", remedy
+
+
 def _free(ports: dict[str, Any] | None, used: Iterable[str], console: str | None) -> str:
     """The ports of a board that one more device could take."""
     names = [name for name, port in (ports or {}).items() if name not in used and port.get("tty") != console]
@@ -628,4 +646,4 @@ def _radio(raw: dict[str, Any]) -> Iterator[Finding]:
         yield ("network", "ibss"), "is missing, and the link is ibss", "give ssid, frequency_mhz and bssid"
 
 
-_CHECKS = (_numbers, _addresses, _devices, _tasks, _standby, _boards, _radio)
+_CHECKS = (_numbers, _addresses, _devices, _tasks, _standby, _required_sensors, _boards, _radio)

@@ -106,6 +106,32 @@ CASES = {
     "no such task": Case(
         ROBOTS, "[heading]", "[haeding]", "robot1.control_tasks.0", "no file…one of control, heading", "haeding"
     ),
+    "overruns by the thousand": Case(
+        ALL, "overruns_percent: 1", "overruns_percent: 1000", "health.overruns_percent", "out of range…0 to 100"
+    ),
+    "overruns in words": Case(
+        ALL, "overruns_percent: 1", "overruns_percent: few", "health.overruns_percent", "not a number…digits"
+    ),
+    "sensor of no task": Case(
+        ALL,
+        "required_sensors: []",
+        "required_sensors: [gyro]",
+        "health.required_sensors.0",
+        "not TASK.BLOCK…heading.gyro",
+        "gyro",
+        also=1,
+    ),
+    "sensor of a task that no robot has": Case(
+        ALL,
+        "required_sensors: []",
+        "required_sensors: [valves.command]",
+        "health.required_sensors.0",
+        "no robot has a control task valves…sensor of heading",
+        "valves",
+    ),
+    "health misspelt": Case(
+        ALL, "overruns_percent: 1", "overrun_percent: 1", "health.overrun_percent", "mean overruns_percent"
+    ),
     "task twice": Case(ROBOTS, "[heading]", "[heading, heading]", "robot1.control_tasks.1", "already…once", "heading"),
     "stands by for a task it has not": Case(
         ROBOTS,

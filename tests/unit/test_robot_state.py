@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import jinja2
 import pytest
@@ -80,3 +83,65 @@ def test_a_computer_of_another_kind_is_refused(board: str, machine: str, right: 
         "wanted": {"machine": inventory.load_fleet().boards[board].machine, "uarts": ["ttyS0"]},
     }
     assert all(language.compile_expression(each)(robot=robot) for each in judged) is right
+
+
+PARAM = """#!/bin/sh
+[ "$*" = "--status=json heading" ] || {{ echo "flotilla-param: no task runs here" >&2; exit 1; }}
+echo . >>{directory}/calls
+exec cat {directory}/$(wc -l <{directory}/calls)
+"""
+
+
+def looked_at(library: ModuleType, directory: Path, *said: dict[str, Any], required: tuple[str, ...] = ()) -> Any:
+    """What comes of a task that says these one after the other, and the last one again and again."""
+    program = directory / "flotilla-param"
+    program.write_text(PARAM.format(directory=directory))
+    program.chmod(0o755)
+    for number in range(1, 30):
+        (directory / str(number)).write_text(json.dumps(said[min(number, len(said)) - 1]))
+    return library.Watch(["heading"]).end(list(required))["heading"]
+
+
+def told(steps: int, overruns: int, flag: bool = True) -> dict[str, Any]:
+    return {"steps": steps, "overruns": overruns, "sensors": {"gyro": {"flag": flag, "age_s": 0.1}}}
+
+
+@pytest.fixture
+def robot(library: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Where its programs lie; its time does not pass but by sleeping."""
+    now = [0.0]
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    monkeypatch.setattr(library.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(library.time, "sleep", lambda seconds: now.append(now.pop() + seconds))
+    return tmp_path
+
+
+def test_overruns_of_the_time_it_is_looked_at(library: ModuleType, robot: Path) -> None:
+    """Seen to fail with all overruns since the start, and with a start anew taken for a count that goes back."""
+    assert looked_at(library, robot, told(1000, 7), told(1100, 9))["lately"] == {"steps": 100, "overruns": 2}
+    (robot / "calls").unlink()
+    assert looked_at(library, robot, told(1000, 7), told(40, 3))["lately"] == {"steps": 40, "overruns": 3}
+    assert library.time.monotonic() == 2 * library.LOOKED_AT_S
+
+
+def test_required_sensors_are_waited_for_and_no_others(library: ModuleType, robot: Path) -> None:
+    """Those of another task neither. Seen to fail where the first answer counts, and without an end."""
+    silent = told(100, 0, flag=False)
+    for required, flag in ((("heading.gyro",), True), (("other.gyro",), False), ((), False)):
+        found = looked_at(library, robot, silent, silent, told(300, 0), required=required)
+        assert found["sensors"]["gyro"]["flag"] is flag
+        (robot / "calls").unlink()
+    before = library.time.monotonic()
+    assert looked_at(library, robot, silent, required=("heading.gyro",))["sensors"]["gyro"]["flag"] is False
+    assert library.PATIENCE_S < library.time.monotonic() - before < library.PATIENCE_S + 1
+
+
+def test_a_task_that_says_nothing(library: ModuleType, robot: Path) -> None:
+    (robot / "flotilla-param").write_text("#!/bin/sh\necho 'flotilla-param: no task x runs here' >&2; exit 1\n")
+    (robot / "flotilla-param").chmod(0o755)
+    assert library.Watch(["x"]).end([]) == {"x": {"problem": "flotilla-param: no task x runs here"}}
+
+
+def test_a_robot_without_tasks_is_not_waited_for(library: ModuleType, robot: Path) -> None:
+    assert library.Watch([]).end(["heading.gyro"]) == {}
+    assert library.time.monotonic() == 0

@@ -13,7 +13,7 @@ from ansible.plugins.action import ActionBase
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))  # the project
 
-from images.builder import provision
+from images.builder import health, provision
 from images.builder.errors import UserError
 
 KEEP = [
@@ -27,7 +27,8 @@ TASK = "flotilla-task@"
 
 class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
     """Result `state`: what `library/robot_state.py` found, each drift with the `role` that mends it; `wanted`: what the
-    inventory says; `faults`: by role, what is wrong besides files; `up_to_date`: nothing is to be mended.
+    inventory says; `faults`: by role, what is wrong besides files; `up_to_date`: nothing is to be mended; `unhealthy`:
+    what the variable `health` does not permit of what control tasks say of themselves.
     """
 
     _supports_check_mode = True
@@ -40,6 +41,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         try:
             fleet, robot = provision.robot(*place)
             files = provision.files(*place)
+            policy = health.policy(task_vars.get("health", {}))
         except UserError as error:
             raise AnsibleActionFail(str(error)) from error
         arguments = {
@@ -50,6 +52,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             "keep": KEEP,
             "interface": fleet.interface(robot),
             "control_tasks": robot.control_tasks,
+            "required_sensors": policy.required_sensors,
         }
         result: dict[str, Any] = self._execute_module("robot_state", arguments, task_vars=task_vars)
         if "state" in result:
@@ -71,6 +74,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
                 "wanted": wanted,
                 "faults": faults,
                 "up_to_date": not state["drift"] and not any(faults.values()),
+                "unhealthy": health.complaints(state["tasks"], policy),
             }
         return result
 

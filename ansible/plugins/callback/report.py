@@ -1,8 +1,8 @@
 """What a run did to the fleet, as `build/reports/fleet.json` for programs and `fleet.html` for people.
 
 `robots`: by name, `outcome` (`up to date`, `changed`, `would change`, `failed`, `unreachable`), `mended` (what was, or
-would be, put right), `messages` (why it failed), and `state` (what `robot_state` last found). Robots that a stopped
-roll-out did not come to are not there.
+would be, put right), `messages` (why it failed), `state` and `unhealthy` (what `robot_state` last found). Robots that a
+stopped roll-out did not come to are not there.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class CallbackModule(CallbackBase):  # type: ignore[misc]  # Ansible has no type
         found = result._result
         robot = self._robot(result)
         if "state" in found and "faults" in found:
-            robot["state"] = found["state"]
+            robot |= {key: found[key] for key in ("state", "unhealthy")}
         if found.get("changed"):
             differences = found.get("diff") or []
             listed = [each for each in differences if isinstance(each, dict)] if isinstance(differences, list) else []
@@ -92,7 +92,7 @@ class CallbackModule(CallbackBase):  # type: ignore[misc]  # Ansible has no type
         self._display.display(f"{paths.shown(directory / self._playbook)}.html")
 
     def _robot(self, result: Any) -> dict[str, Any]:
-        empty: dict[str, Any] = {"outcome": "", "mended": [], "messages": [], "state": None}
+        empty: dict[str, Any] = {"outcome": "", "mended": [], "messages": [], "state": None, "unhealthy": []}
         return self._robots.setdefault(result._host.get_name(), empty)
 
 
