@@ -22,10 +22,10 @@ def test_one_table_where_there_is_no_terminal(tmp_path: Path) -> None:
         said, complaints = process.communicate(timeout=PATIENCE)
     assert (process.returncode, complaints) == (0, "")
     title, valves, control = (line.split() for line in said.splitlines())
-    assert title[:8] == ["robot", "task", "stream", "Hz", "of", "came", "refused", "lost"]
+    assert title[:9] == ["robot", "task", "ms", "stream", "Hz", "of", "came", "refused", "lost"]
     came, refused, lost = (int(valves[title.index(what)]) for what in ("came", "refused", "lost"))
-    assert [*valves[:3], valves[4]] == ["robot1", "valves", "report", "100"]
+    assert [*valves[:4], valves[5]] == ["robot1", "valves", "10", "report", "100"]
     assert (came > 0, refused, abs(9 * lost - came) <= 9) == (True, 0, True)
     assert valves[-2:] == ["not", "good"]
-    assert [*control[:3], control[4]] == ["robot3", "control", "report", "10"]
+    assert [*control[:4], control[5]] == ["robot3", "control", "10", "report", "10"]
     assert control[-4:] == ["not", "flying,", "not", "done"]

@@ -1,4 +1,4 @@
-"""`make param`: parameters of a control task that runs on a robot, read and set by its own `flotilla-param`."""
+"""Control tasks of a robot from the station: parameters, by its own `flotilla-param` (`make param`); start and stop."""
 
 from __future__ import annotations
 
@@ -19,8 +19,17 @@ def param(robot: Robot, task: str, parameter: str | None = None, value: str | No
     UserError with the robot's reason, or when it does not answer.
     """
     words = ["flotilla-param", task, *([parameter] if parameter else []), *([value] if value is not None else [])]
+    return _said(robot, words)
+
+
+def service(robot: Robot, task: str, do: str) -> str:
+    """Start or stop a control task, as the playbook `tasks.yml` does. UserError as above."""
+    return _said(robot, ["sudo", "systemctl", do, f"flotilla-task@{task}.service"])
+
+
+def _said(robot: Robot, words: list[str]) -> str:
     argv = [*boot.ssh_command(robot), shlex.join(words)]
-    done = subprocess.run(argv, capture_output=True, encoding="utf-8", check=False)
+    done = subprocess.run(argv, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False)
     if done.returncode == _SSH_FAILED:
         raise boot.no_answer(robot, done.stderr.strip())
     if done.returncode:

@@ -11,6 +11,7 @@ from pathlib import Path
 from images.builder import inventory, paths, progress
 from images.builder.errors import UserError, exit_status
 from images.builder.fleet import Fleet
+from runtime.station.dialog import Dialog, keyboard
 from runtime.station.live import PORT, Server
 from runtime.station.receiver import Receiver, listen, receive
 from runtime.station.record import Recorder
@@ -39,6 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
     receiver = Receiver(known)
     doing = []
     seconds = arguments.seconds
+    keys = {}
     with contextlib.ExitStack() as during:
         if arguments.live is not None:
             receiver.sinks.append(Server(known, arguments.live_address, arguments.live))
@@ -48,15 +50,16 @@ def run(arguments: argparse.Namespace) -> None:
             doing.append("recording")
         if arguments.top:
             states = Services(fleet.robots.values()).states if arguments.ask else {}
-            top = Top(receiver, states)
+            top = Top(receiver, states, Dialog({robot.name: robot for robot in fleet.robots.values()}))
             receiver.sinks.append(top)
             if not doing and not top.console.is_terminal:
                 seconds = seconds or TOP_S
             during.enter_context(top.screen())
+            keys = during.enter_context(keyboard(top.press)) if top.console.is_terminal else {}
             note = None
         else:
             note = during.enter_context(progress.step(" and ".join(doing))).note
-        receive(receiver, sockets, seconds, note)
+        receive(receiver, sockets, seconds, note, keys)
     ends = [sink.end() for sink in receiver.sinks]
     print("\n".join([*(receiver.summary if doing else []), *ends]))
 

@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Protocol
 
 from images.builder.errors import UserError
@@ -103,9 +104,16 @@ def listen(ports: Iterable[int], address: str) -> list[socket.socket]:
 
 
 def receive(
-    receiver: Receiver, sockets: list[socket.socket], seconds: float | None, note: Callable[[str], None] | None
+    receiver: Receiver,
+    sockets: list[socket.socket],
+    seconds: float | None,
+    note: Callable[[str], None] | None,
+    others: Mapping[int, Callable[[], bool]] = MappingProxyType({}),
 ) -> None:
-    """Until SIGINT or SIGTERM, or for so many seconds; `note` is told how far it is."""
+    """Until SIGINT or SIGTERM, or for so many seconds; `note` is told how far it is. `others`: what to call when a file
+    descriptor is readable, until it returns False."""
+    readers = dict(others)
+    by_fd = {one.fileno(): one for one in sockets}
     wake, waker = socket.socketpair()
     waker.setblocking(False)
     signal.set_wakeup_fd(waker.fileno())
@@ -114,11 +122,14 @@ def receive(
     end = time.monotonic() + (seconds if seconds is not None else float("inf"))
     refreshed = time.monotonic()
     while (now := time.monotonic()) < end:
-        ready, _, _ = select.select([wake, *sockets], [], [], min(end - now, REFRESH_S))
-        if wake in ready:
+        ready, _, _ = select.select([wake.fileno(), *by_fd, *readers], [], [], min(end - now, REFRESH_S))
+        if wake.fileno() in ready:
             break
-        for one in ready:
-            drain(one, receiver)
+        for fd in ready:
+            if fd in by_fd:
+                drain(by_fd[fd], receiver)
+            elif not readers[fd]():
+                del readers[fd]
         if time.monotonic() - refreshed >= REFRESH_S:
             receiver.refresh()
             refreshed = time.monotonic()

@@ -1,13 +1,15 @@
-"""Whether control tasks run: asked of each robot by ssh every ASK_S, over one connection that stays."""
+"""Whether control tasks run, and how: asked of each robot by ssh every ASK_S, over one connection that stays."""
 
 from __future__ import annotations
 
+import json
 import shlex
 import subprocess
 import threading
 import time
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 from images.builder import boot
 from images.builder.errors import UserError
@@ -20,6 +22,19 @@ _SETTINGS = ("ConnectTimeout=5", "ServerAliveInterval=5", "ServerAliveCountMax=2
 
 
 @dataclass(frozen=True)
+class Told:
+    """By the running task itself; runtime/executive/status.h."""
+
+    period_s: float
+    overruns: int
+    """Since it was started."""
+    lately: int
+    """Of them, those since it was asked before."""
+    flags: dict[str, bool]
+    """Of its sensors."""
+
+
+@dataclass(frozen=True)
 class State:
     """Of a control task's service."""
 
@@ -27,14 +42,18 @@ class State:
     """`running 75 s`, `failed`: the service manager's, and since when."""
     good: bool
     """It runs, and has done so since it was started."""
+    told: Told | None = None
+    """None: it does not run."""
 
 
 def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
     """Its tasks by name, again and again, until UserError says why it does not answer any more."""
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
-    longest = 1 + len(units) * (len(_PROPERTIES) + 1)  # lines of an answer
+    longest = 1 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
-    script = f"while cat /proc/uptime && {show} && echo {_END}; do sleep {ASK_S}; done"
+    tell = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
+    script = f"while cat /proc/uptime && {show} && {{ {tell}; }} && echo {_END}; do sleep {ASK_S}; done"
+    before: dict[str, State] = {}
     program, *way = boot.ssh_command(robot)
     options = [word for setting in _SETTINGS for word in ("-o", setting)]
     argv = [*boot.DIE_WITH_PARENT, program, *options, *way, shlex.join(["sudo", "sh", "-c", script])]
@@ -49,8 +68,9 @@ def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
                     lines.append(line)
                     continue
                 try:
-                    yield _states("".join(lines))
-                except (ValueError, KeyError) as error:
+                    before = _states(lines[: -len(units)], lines[-len(units) :], before)
+                    yield before
+                except (ValueError, KeyError, TypeError) as error:
                     raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {error!r}") from error
                 lines = []
             raise boot.no_answer(robot, process.stderr.read().strip() or "the connection broke")
@@ -58,9 +78,10 @@ def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
             process.kill()
 
 
-def _states(said: str) -> dict[str, State]:
-    """What one round says: /proc/uptime, then the services, an empty line between them."""
-    uptime, _, shown = said.partition("\n")
+def _states(said: list[str], told: list[str], before: dict[str, State]) -> dict[str, State]:
+    """What one round says: /proc/uptime, then the services, an empty line between them; and the tasks, a line each."""
+    uptime, _, shown = "".join(said).partition("\n")
+    reports = {report["task"]: report for report in map(json.loads, told) if report}
     found = {}
     for block in shown.strip().split("\n\n"):
         unit = dict(line.split("=", 1) for line in block.splitlines())
@@ -73,8 +94,20 @@ def _states(said: str) -> dict[str, State]:
             + (f" {since_s:.0f} s" if active else "")
             + (f", restarted {restarts}×" if restarts else "")
         )
-        found[task] = State(words, active and not restarts)
+        past = before[task].told if task in before else None
+        found[task] = State(words, active and not restarts, _told(reports[task], past) if task in reports else None)
     return found
+
+
+def _told(report: dict[str, Any], past: Told | None) -> Told:
+    overruns = int(report["overruns"])
+    counted = past.overruns if past else overruns
+    return Told(
+        period_s=float(report["period_s"]),
+        overruns=overruns,
+        lately=overruns - (counted if counted <= overruns else 0),  # it was started anew
+        flags={name: bool(sensor["flag"]) for name, sensor in report["sensors"].items()},
+    )
 
 
 class Services:

@@ -18,6 +18,8 @@ from images.builder.fleet import Fleet
 from runtime.station.recording import Field, Value
 
 _BYTE_ORDERS = {"little": "<", "big": ">"}
+_CHARGE = {"oceanserver": "charge"}
+"""Ports that are a battery's state of charge, by type of block."""
 _SECONDS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
 
 
@@ -40,6 +42,8 @@ class Stream:
     """The task's period."""
     every: int
     """Steps of the task from one datagram to the next."""
+    charge: str | None = None
+    """The field that is a battery's state of charge, 0 to 1."""
 
     @property
     def length(self) -> int:
@@ -102,12 +106,20 @@ def of_task(robot: str, address: str, name: str, task: dict[str, Any], stations:
             byte_order,
             step_s=duration_s(task["period"]),
             every=int(sender.get("every", 1)),
+            charge=next(
+                (name for name, wire in blocks[packer].get("in", {}).items() if _is_charge(blocks, wire)), None
+            ),
         )
 
 
 def _listed(value: str | list[str]) -> list[str]:
     """A parameter that may be a list or one value."""
     return value if isinstance(value, list) else [value]
+
+
+def _is_charge(blocks: dict[str, Any], wire: Any) -> bool:
+    block, _, port = wire.partition(".") if isinstance(wire, str) else ("", "", "")
+    return block in blocks and _CHARGE.get(blocks[block]["type"]) == port
 
 
 def duration_s(text: str) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import closing
 from ipaddress import IPv4Address
@@ -12,7 +13,7 @@ import pytest
 from images.builder import boot
 from images.builder.errors import UserError
 from images.builder.fleet import Robot
-from runtime.station.services import State, ask
+from runtime.station.services import State, Told, ask
 
 ROBOT = Robot(
     name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"), control_tasks=["valves", "sensors"]
@@ -52,6 +53,14 @@ def program(directory: Path, name: str, script: str) -> None:
     (directory / name).chmod(0o755)
 
 
+def tell(robot: Path, **overruns: int | None) -> None:
+    """What tasks say of themselves; a stopped one nothing."""
+    for task, count in overruns.items():
+        report = {"task": task, "period_s": 0.01, "overruns": count, "sensors": {"gyro": {"flag": False, "age_s": 1.5}}}
+        (robot / task).write_text(json.dumps(report) + "\n") if count is not None else (robot / task).unlink()
+    program(robot, "flotilla-param", f'#!/bin/sh\n[ "$1" = --status=json ] && exec /bin/cat {robot}/"$2"\n')
+
+
 def say(robot: Path, *units: str) -> None:
     beside = robot / "said.new"
     beside.write_text("\n".join(units))
@@ -69,6 +78,26 @@ def test_what_services_do(robot: Path) -> None:
         say(robot, unit("valves", "inactive", "dead", 0, 0), unit("sensors", "activating", "auto-restart", 7, 0))
         changed = {"valves": State("dead", False), "sensors": State("auto-restart, restarted 7×", False)}
         assert until(answers, changed)
+
+
+def test_what_tasks_say_of_themselves(robot: Path) -> None:
+    """Overruns are new since it was asked before. Seen to fail with those of a start anew taken for a decrease."""
+    say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
+
+    def told(overruns: int, lately: int) -> Told:
+        return Told(0.01, overruns, lately, {"gyro": False})
+
+    tell(robot, valves=7, sensors=0)
+    with closing(ask(ROBOT)) as answers:
+        first = next(answers)
+        assert (first["valves"].told, first["sensors"].told) == (told(7, 0), told(0, 0))
+        tell(robot, valves=9, sensors=None)
+        assert any(
+            (a["valves"].told, a["sensors"].told) == (told(9, 2), None)
+            for a, _ in zip(answers, range(10000), strict=False)
+        )
+        tell(robot, valves=3)
+        assert any(a["valves"].told == told(3, 3) for a, _ in zip(answers, range(10000), strict=False))
 
 
 def until(answers: Iterator[dict[str, State]], wanted: dict[str, State]) -> bool:

@@ -8,7 +8,7 @@ import pytest
 
 from runtime.station.receiver import Receiver
 from runtime.station.recording import Field
-from runtime.station.services import State
+from runtime.station.services import State, Told
 from runtime.station.telemetry import Stream, of_task
 from runtime.station.top import Heard, Row, Top
 
@@ -41,10 +41,15 @@ def heard(steps: Iterable[int], bad: Iterable[int] = ()) -> Row:
     return found.row(now_ns)
 
 
+def row(rate_hz: float, flags: dict[str, float], link: float = 1, age_s: float | None = 0) -> Row:
+    """Where nothing was lost, and there is no battery."""
+    return Row(rate_hz=rate_hz, lost=0, link=link, age_s=age_s, charge=None, flags=flags)
+
+
 def test_all_came() -> None:
     """In less than the window too. Seen to fail without regard to that."""
-    assert heard(range(2, 52, 2)) == Row(rate_hz=50, lost=0, age_s=0, flags={"good": 1, "flying": 1})
-    assert heard(range(2, 402, 2)) == Row(rate_hz=50, lost=0, age_s=0, flags={"good": 1, "flying": 1})
+    assert heard(range(2, 52, 2)) == row(rate_hz=50, flags={"good": 1, "flying": 1})
+    assert heard(range(2, 402, 2)) == row(rate_hz=50, flags={"good": 1, "flying": 1})
 
 
 @pytest.mark.parametrize(
@@ -69,9 +74,9 @@ def test_a_silent_stream_has_age_and_no_rate() -> None:
     """Its flags are the last ones. Seen to fail where the window ends with the last datagram."""
     found = Heard(STREAM, 0)
     found.take({"step": 1, "good": False, "valves": (True,) * 8, "flying": True}, SECOND_NS)
-    assert found.row(2 * SECOND_NS) == Row(rate_hz=0.5, lost=0, age_s=1, flags={"good": 0, "flying": 1})
-    assert found.row(9 * SECOND_NS) == Row(rate_hz=0, lost=0, age_s=8, flags={"good": 0, "flying": 1})
-    assert Heard(STREAM, 0).row(SECOND_NS) == Row(rate_hz=0, lost=0, age_s=None, flags={})
+    assert found.row(2 * SECOND_NS) == row(0.5, {"good": 0, "flying": 1}, age_s=1)
+    assert found.row(9 * SECOND_NS) == row(0, {"good": 0, "flying": 1}, link=0, age_s=8)
+    assert Heard(STREAM, 0).row(SECOND_NS) == row(0, {}, link=0, age_s=None)
 
 
 def test_flags_are_those_of_the_window() -> None:
@@ -93,21 +98,26 @@ def test_the_table_says_it() -> None:
     receiver.take(b"short", other.address, other.port, now_ns)
     receiver.take(bytes(12), "10.42.0.9", STREAM.port, now_ns)
     assert [" ".join(line.split()) for line in top.end().splitlines()] == [
-        "robot task stream Hz of came refused lost % age s flags",
-        "robot1 valves report 37.5 50 150 0 49 24.6 0.02 good, not flying",
-        "robot2 control report 0.0 10 0 1 never",
+        "robot task ms stream Hz of came refused lost % link% age s charge% flags",
+        "robot1 valves 10 report 37.5 50 150 0 49 24.6 76 0.02 good, not flying",
+        "robot2 control 10 report 0.0 10 0 1 never",
         "1 datagrams of strangers left out",
     ]
 
 
 def test_tasks_are_shown_with_streams_or_without() -> None:
     """Seen to fail where tasks without streams are left out."""
-    states = {("robot1", "valves"): State("running 5 s", True), ("robot1", "heading"): State("no answer", False)}
+    states = {
+        ("robot1", "valves"): State("running 5 s", True, Told(0.01, 7, 2, {"gyro": True, "laser": False})),
+        ("robot1", "heading"): State("no answer", False),
+        ("robot1", "slow"): State("running 5 s", True, Told(0.25, 0, 0, {})),
+    }
     top = Top(Receiver([STREAM]), states, clock=lambda: 0)
     assert [" ".join(line.split()) for line in top.end().splitlines()] == [
-        "robot task stream Hz of came refused lost % age s flags runs",
-        "robot1 valves report 0.0 50 0 0 0 never running 5 s",
+        "robot task ms stream Hz of came refused lost % link% age s charge% flags runs overruns sensors",
+        "robot1 valves 10 report 0.0 50 0 0 0 0 never running 5 s 7 (+2) gyro, not laser",
         "robot1 heading no answer",
+        "robot1 slow 250 running 5 s 0",
     ]
 
 
@@ -128,3 +138,38 @@ def test_the_rate_is_the_task_file_s() -> None:
     assert (stream.step_s, stream.every, stream.rate_hz) == pytest.approx((0.0025, 4, 100))
     (stream,) = of_task("robot1", "10.42.0.1", "valves", task | {"period": "500us"}, {"10.42.0.254"})
     assert stream.rate_hz == pytest.approx(500)
+
+
+def test_the_link_is_that_of_the_last_steps() -> None:
+    """Half of the steps were lost, long ago or now. Seen to fail with all steps since the start."""
+    assert heard([*range(2, 200, 4), *range(200, 600, 2)]).link == 1
+    assert heard([*range(2, 600, 2), *range(602, 1200, 4)]).link == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_batterys_charge_is_found_by_its_block() -> None:
+    """Whatever the stream calls it. Seen to fail where any field of a battery's is its charge."""
+    task = {
+        "period": "10 ms",
+        "blocks": {
+            "power": {"type": "oceanserver", "parameters": {"device": "/dev/robot/battery"}},
+            "report": {
+                "type": "pack",
+                "in": {"left": "power.remaining", "soc": "power.charge", "one": "1"},
+                "parameters": {"types": ["double", "double", "double"], "names": ["left", "soc", "one"]},
+            },
+            "out": {
+                "type": "udp-send",
+                "in": {"data": "report.out"},
+                "parameters": {"address": "10.42.0.254", "port": "5020"},
+            },
+        },
+    }
+    (stream,) = of_task("robot1", "10.42.0.1", "valves", task, {"10.42.0.254"})
+    found = Heard(stream, 0)
+    assert (stream.charge, found.row(1).charge) == ("soc", None)
+    found.take({"left": 60.0, "soc": 0.15, "one": 1.0}, 1)
+    assert found.row(1).charge == 0.15
+    receiver = Receiver([stream])
+    top = Top(receiver, clock=lambda: 0)
+    top.take(stream, {"left": 60.0, "soc": 0.15, "one": 1.0}, 0)
+    assert top.end().split()[-1] == "15"
