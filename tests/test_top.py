@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import select
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+from images.builder import paths
 from tests.running import PATIENCE
-from tests.station import Robots, on_loopback, station
+from tests.station import ADDRESS, Robots, on_loopback, station
 
 
 def test_one_table_where_there_is_no_terminal(tmp_path: Path) -> None:
@@ -29,3 +36,35 @@ def test_one_table_where_there_is_no_terminal(tmp_path: Path) -> None:
     assert valves[-2:] == ["not", "good"]
     assert [*control[:4], control[5]] == ["robot3", "control", "10", "report", "10"]
     assert control[-4:] == ["not", "flying,", "not", "done"]
+
+
+def test_keys_on_a_terminal(tmp_path: Path) -> None:
+    """A question, its answer, a key that is none, and Ctrl-C, by the keys of a terminal."""
+    fleet = on_loopback(tmp_path / "inventory")
+    terminal, theirs = pty.openpty()
+    argv = [sys.executable, "-m", "runtime.station", "--top", "--inventory", fleet, "--address", ADDRESS]
+    with subprocess.Popen(
+        argv, cwd=paths.PROJECT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+        preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)), env=os.environ | {"TERM": "xterm"},
+    ) as process:  # fmt: skip
+        os.close(theirs)
+        try:
+            said = ""
+            for key, answer in (
+                ("", "Ctrl-C end"),
+                ("x", "stop robot"),
+                ("n", "left as it is"),
+                ("\x02", "does nothing"),
+            ):
+                os.write(terminal, key.encode())
+                said = ""
+                end = time.monotonic() + PATIENCE
+                while answer not in said:
+                    assert select.select([terminal], [], [], end - time.monotonic())[0], said
+                    said += os.read(terminal, 65536).decode(errors="replace")
+            os.write(terminal, b"\x03")
+            assert process.wait(PATIENCE) == 0
+        finally:
+            process.kill()
+            os.close(terminal)
+    assert "Traceback" not in said

@@ -121,7 +121,7 @@ def test_a_parameter_is_set(screen: Screen) -> None:
         ("é\x01", "that key does nothing"),
         ("pa.b x\n", "robot1 heading a.b x: robot1: task heading: block a: x is not a number"),
         ("x\x1b", "left as it is"),
-        ("p" + "y" * 1000 + "\x1b[A\x01\n", "from step 5"),
+        ("p\x1b[A\x01" + "y" * 1000 + "\n", "from step 5"),
     ],
 )
 def test_what_cannot_be_is_answered(screen: Screen, typed: str, said: str) -> None:
