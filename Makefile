@@ -153,7 +153,7 @@ record: | setup ## what robots tell this station, as an MCAP file for Foxglove o
 live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
 	$(Q)$(station) --live $(PORT) $(if $(OUT),--record $(OUT))
 
-top: | setup ## how it comes: rate, loss, age, flags [SECONDS=]; also whether control tasks run: ASK=1; OUT= and PORT= as above
+top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
 	$(Q)$(station) --top $(if $(filter-out 0,$(ASK)),--ask) $(if $(OUT),--record $(OUT)) $(if $(PORT),--live $(PORT))
 
 param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]

@@ -42,7 +42,7 @@ def test_keys_on_a_terminal(tmp_path: Path) -> None:
     """A question, its answer, a key that is none, and Ctrl-C, by the keys of a terminal."""
     fleet = on_loopback(tmp_path / "inventory")
     terminal, theirs = pty.openpty()
-    argv = [sys.executable, "-m", "runtime.station", "--top", "--inventory", fleet, "--address", ADDRESS]
+    argv = [sys.executable, "-m", "runtime.station", "--top", "--inventory", str(fleet), "--address", ADDRESS]
     with subprocess.Popen(
         argv, cwd=paths.PROJECT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
         preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)), env=os.environ | {"TERM": "xterm"},
