@@ -24,6 +24,8 @@ from images.builder.errors import UserError
 TEMPLATE = paths.PROJECT / "images" / "apps" / "ert_block.c.j2"
 GENERATED = "generated"
 """Folder of an app with what the coder made."""
+INNER = "flotilla_simulink.h"
+"""A file there if the model has blocks of the runtime, which `flotilla-blocks --legacy-code` made."""
 _TYPES = {
     "real_T": "double", "real64_T": "double", "time_T": "double", "double": "double",
     "real32_T": "single", "float": "single", "boolean_T": "boolean", "bool": "boolean", "_Bool": "boolean",
@@ -102,6 +104,8 @@ class Model:
     error_status: bool = False
     period_s: float | None = None
     """Of the fastest rate, where the code says so."""
+    inner: bool = False
+    """It calls blocks of the runtime."""
 
 
 def block(directory: Path, model: str, name: str, sample_times_s: list[float], out: Path) -> None:
@@ -114,6 +118,7 @@ def block(directory: Path, model: str, name: str, sample_times_s: list[float], o
             raise UserError(f"{paths.shown(file)} is missing; {remedy}")
     shutil.copytree(generated, out, ignore=shutil.ignore_patterns("ert_main.*", "*.o"))
     found = read(model, preprocess(out, model), source.read_text(errors="replace"), sample_times_s)
+    found.inner = (out / INNER).is_file()
     (out / "flotilla_block.c").write_text(render(found, name))
 
 

@@ -2,6 +2,8 @@
 #define _GNU_SOURCE
 #include "block.h"
 
+#include "inner.h"
+
 #include <errno.h>
 #include <flotilla/block.h>
 #include <sched.h>
@@ -174,6 +176,7 @@ void block_destroy(struct fl_block *block)
 {
     if (!block)
         return;
+    inner_destroy(block);
     for (struct fl_memory *memory = block->service->memory, *next; memory; memory = next) {
         next = memory->next;
         free(memory);

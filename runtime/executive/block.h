@@ -37,7 +37,7 @@ static inline void block_prefetch(const struct fl_block *block)
         __builtin_prefetch((const char *)block + at);
 }
 
-/* Free it and all it allocated; after terminate. */
+/* Free it and all it allocated, inner blocks too; after terminate. */
 void block_destroy(struct fl_block *block);
 
 #endif

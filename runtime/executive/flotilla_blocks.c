@@ -1,6 +1,7 @@
 /* flotilla-blocks: lists the blocks that tasks can use. */
 #define _GNU_SOURCE
 #include "block.h"
+#include "legacy_code.h"
 #include "registry.h"
 
 #include <getopt.h>
@@ -8,7 +9,11 @@
 
 static const char usage[] =
     "usage: flotilla-blocks [--blocks DIRECTORY] [NAME]...\n"
+    "       flotilla-blocks [--blocks DIRECTORY] --legacy-code [--out DIRECTORY] [NAME [PARAMETER=VALUE]...]...\n"
     "List all blocks, a line each; of the named ones all ports and parameters.\n"
+    "  --legacy-code       make Simulink blocks of all or of the named ones: write a script for its Legacy Code Tool,\n"
+    "                      and the C files that it takes; parameters with a VALUE are fixed, the others Simulink's\n"
+    "  --out DIRECTORY     where to (default: .)\n"
     "  --blocks DIRECTORY  plug-ins with further blocks (default: " FLOTILLA_BLOCKS "); several are separated by ':'\n"
     "  --help, --version\n";
 
@@ -63,17 +68,24 @@ static void print_type(const struct fl_block_type *type)
 
 int main(int argc, char **argv)
 {
-    static const struct option options[] = {{"blocks", required_argument, NULL, 'b'},
-                                            {"help", no_argument, NULL, 'h'},
-                                            {"version", no_argument, NULL, 'v'},
-                                            {0}};
-    const char *blocks = FLOTILLA_BLOCKS;
+    static const struct option options[] = {
+        {"blocks", required_argument, NULL, 'b'}, {"legacy-code", no_argument, NULL, 'l'},
+        {"out", required_argument, NULL, 'o'},    {"help", no_argument, NULL, 'h'},
+        {"version", no_argument, NULL, 'v'},      {0}};
+    const char *blocks = FLOTILLA_BLOCKS, *out = ".";
+    bool legacy_code = false;
     struct registry registry = {0};
     int status = 0;
     for (int option; (option = getopt_long(argc, argv, "", options, NULL)) != -1;) {
         switch (option) {
         case 'b':
             blocks = optarg;
+            break;
+        case 'l':
+            legacy_code = true;
+            break;
+        case 'o':
+            out = optarg;
             break;
         case 'h':
             fputs(usage, stdout);
@@ -90,9 +102,11 @@ int main(int argc, char **argv)
     faults += registry_load_plugins(&registry);
     if (faults)
         status = 1;
-    for (size_t i = 0; i < registry.count && optind == argc; i++)
+    if (legacy_code && !legacy_code_write(&registry, argv + optind, argc - optind, out))
+        status = 2;
+    for (size_t i = 0; i < registry.count && optind == argc && !legacy_code; i++)
         printf("%-20s %s\n", registry.types[i]->name, given(registry.types[i]->summary));
-    for (int i = optind; i < argc; i++) {
+    for (int i = optind; i < argc && !legacy_code; i++) {
         const struct fl_block_type *type = registry_find(&registry, argv[i]);
         const char *nearest = type ? NULL : registry_nearest(&registry, argv[i]);
         if (type) {

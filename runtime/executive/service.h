@@ -16,7 +16,10 @@ struct fl_service {
     char failure[FL_FAILURE_BYTES];
     int priority; /* SCHED_FIFO of the block's threads; 0: ordinary */
     struct fl_port *in_ports, *out_ports;
-    size_t near_used; /* of the bytes beside the block */
+    size_t near_used;          /* of the bytes beside the block */
+    struct registry *registry; /* where inner blocks are looked for; NULL: it can have none */
+    struct fl_inner *inner;    /* its inner blocks (flotilla/inner.h), the last one first */
+    bool inner_failed;
 };
 
 /* Start a thread named after the block, at the service's priority where that is allowed; 0 or an errno. */
