@@ -1,4 +1,9 @@
 # Front door. `make help` lists the targets; V=1 shows the commands.
+# `make deploy BUILD=remote` compiles on the robot, as ON_ROBOT=1 does; of everything else BUILD is the directory of outputs.
+ifeq ($(BUILD) $(filter deploy,$(MAKECMDGOALS)),remote deploy)
+override BUILD := build
+ON_ROBOT := 1
+endif
 BUILD ?= build
 export BUILD
 VENV := $(BUILD)/venv
@@ -58,9 +63,9 @@ provision: | setup ## robots become what the inventory says: make provision [ROB
 new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|fmu|make NAME=hover
 	$(Q)$(FLOTILLA) new-app --kind $(call need,KIND) --name $(call need,NAME)
 
-deploy: | setup ## build, send and run an app: make deploy ROBOT=3 APP=dir [KEEP=1 | RUN=start|stop|status|log|remove]
+deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [BUILD=remote] [KEEP=1 | RUN=start|stop|status|log|remove]
 	$(Q)$(FLOTILLA) deploy --robot $(call need,ROBOT) --app $(call need,APP) $(if $(RUN),--run $(RUN)) \
-	    $(if $(filter-out 0,$(KEEP)),--keep)
+	    $(if $(filter-out 0,$(KEEP)),--keep) $(if $(filter-out 0,$(ON_ROBOT)),--on-robot)
 
 ##@ Inputs
 .PHONY: lock check-fleet requirements

@@ -20,7 +20,7 @@ from images.builder.errors import UserError
 def generated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The sample's code, model `sample`, with this computer's compiler in place of the locked one."""
 
-    def command(work: Path, _: str, argv: Sequence[str]) -> None:
+    def command(work: Path, _: str, argv: Sequence[str], *_run: object) -> None:
         subprocess.run([word.replace("/out", str(work)) for word in argv], check=True)
 
     monkeypatch.setattr(runtime, "command", command)

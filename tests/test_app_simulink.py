@@ -197,7 +197,7 @@ blocks:
 def app(flotilla_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A model that calls three blocks, with this computer's compiler in place of the locked one."""
 
-    def command(work: Path, _: str, argv: Sequence[str]) -> None:
+    def command(work: Path, _: str, argv: Sequence[str], *_run: object) -> None:
         subprocess.run([word.replace("/out", str(work)) for word in argv], check=True)
 
     monkeypatch.setattr(runtime, "command", command)

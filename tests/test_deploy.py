@@ -69,10 +69,10 @@ class Bench:
         app_new.create(kind, name, self.apps)
         return self.apps / name
 
-    def place(self, directory: Path) -> None:
+    def place(self, directory: Path, *, on_robot: bool = False) -> None:
         """Build and send it; it does not run."""
         with self.connection() as to:
-            app_deploy.place(to, app.load(directory), self.board)
+            app_deploy.place(to, app.load(directory), self.board, on_robot=on_robot)
 
     def do(self, name: str, run: str) -> str:
         with self.connection() as to:
@@ -194,6 +194,73 @@ def test_a_kept_app_starts_with_the_robot(bench: Bench) -> None:
     assert (after["ActiveState"], after["Kept"], after["NRestarts"]) == ("active", "yes", "0")
     assert bench.status("not-kept")["ActiveState"] == "inactive"
     assert measured(bench.do("kept", "stop"))[1] > 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", app.KINDS)
+def test_a_robot_compiles_what_this_computer_does_to_the_byte(bench: Bench, kind: str) -> None:
+    """A version is the hash of an app's files. It runs, and nothing stays of its build but the compiler.
+
+    Seen to fail with another optimisation on the robot.
+    """
+    name = f"there-{kind}"
+    directory = bench.new(kind, name)
+    bench.place(directory)
+    version = bench.status(name)["Version"]
+    bench.do(name, "remove")
+    bench.place(directory, on_robot=True)
+    assert bench.status(name)["Version"] == version
+    assert "ActiveState=active" in bench.do(name, "start")
+    assert measured(bench.do(name, "stop"))[1] > 0
+    left = bench.guest.shell.run(["sudo", "find", "/data/compilers", "-mindepth", "1"]).stdout.split()
+    assert [Path(path).suffix for path in left] == [".squashfs"]
+    assert "/data/compilers" not in bench.guest.shell.run(["losetup", "-l"]).stdout
+    bench.do(name, "remove")
+
+
+@pytest.mark.long
+def test_what_a_robot_does_not_compile_is_not_deployed(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """The compiler's words come here; what it was given cannot reach the robot."""
+    directory = bench.new("make", "wrong")
+    bench.place(directory)
+    bench.do("wrong", "start")
+    before = runs(bench, "wrong")
+    program, makefile = directory / "main.c", directory / "Makefile"
+    good = program.read_text()
+    program.write_text(good + "\nint wrong = ;\n")
+    with pytest.raises(
+        UserError, match=r"nothing was deployed: robot4: it does not compile \(status 2\); what it said is"
+    ):
+        bench.place(directory, on_robot=True)
+    words = r"main\.c:\d+:\d+: error: expected expression before .;."
+    assert re.search(words, capsys.readouterr().err)
+    assert re.search(words, (paths.BUILD / "compile-i386.log").read_text())
+    program.write_text(good)
+    makefile.write_text("all:\n\tid -u; ls -d /data; nice; touch /usr/mine; touch /dev/mine; false\n")
+    with pytest.raises(UserError, match="it does not compile"):
+        bench.place(directory, on_robot=True)
+    said = capsys.readouterr().err
+    assert "\n65534\n19\n" in said.replace("ls: cannot access '/data': No such file or directory\n", "")
+    assert said.count("touch: cannot touch") == 2
+    assert runs(bench, "wrong") == before
+    bench.do("wrong", "remove")
+
+
+@pytest.mark.long
+def test_a_robot_without_room_for_the_compiler_says_so(bench: Bench) -> None:
+    directory = bench.new("block", "no-room")
+    shell = bench.guest.shell
+    fill = "rm -rf /data/compilers; fallocate -l $(($(df --output=avail -k /data | tail -n 1) - 32768))K /data/filler"
+    shell.run(["sudo", "sh", "-c", fill])
+    try:
+        with pytest.raises(
+            UserError, match=r"/data has \d+ KiB left, and the compiler needs \d+ KiB; compile on the dev"
+        ):
+            bench.place(directory, on_robot=True)
+    finally:
+        shell.run(["sudo", "rm", "/data/filler"])
+    with pytest.raises(UserError, match="there is no app no-room"):
+        bench.do("no-room", "start")
 
 
 def runs(bench: Bench, name: str) -> tuple[str, str]:

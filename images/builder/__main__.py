@@ -55,7 +55,8 @@ def _deploy(arguments: argparse.Namespace) -> None:
             print(app_deploy.command(to, app.name_of(arguments.app), arguments.run))
         else:
             board, show = fleet.boards[robot.board], functools.partial(print, flush=True)
-            print(app_deploy.deploy(to, arguments.app, board, keep=arguments.keep, show=show))
+            options = {"keep": arguments.keep, "on_robot": arguments.on_robot}
+            print(app_deploy.deploy(to, arguments.app, board, show=show, **options))
 
 
 def _new_app(arguments: argparse.Namespace) -> None:
@@ -166,6 +167,7 @@ def _parser() -> argparse.ArgumentParser:
     made["deploy"].add_argument("--app", type=Path, required=True, help="the app's directory")
     made["deploy"].add_argument("--run", help="start, stop, status, log or remove what is on the robot")
     made["deploy"].add_argument("--keep", action="store_true", help="start it with the robot")
+    made["deploy"].add_argument("--on-robot", action="store_true", help="compile it on the robot")
     made["new-app"].add_argument("--kind", required=True)
     made["new-app"].add_argument("--name", required=True)
     made["kernel"].add_argument("--board", required=True, help="name in kernel/kernels.yml")

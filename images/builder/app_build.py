@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from images.builder import app, app_ert, app_fmu, cache, paths, progress, runtime
+from images.builder import app, app_ert, app_fmu, cache, paths, progress, runtime, toolchain
 from images.builder.errors import UserError
 from images.builder.fleet import Board
 
@@ -15,36 +15,41 @@ _BUILT = ("*.o", "*.d", ".git")
 """What a copy of a project leaves out: what its own build left behind may be for another processor."""
 
 
-def build(subject: app.App, board: Board, out: Path) -> None:
-    """Fill `out` with what goes to a robot of `board`; UserError with the compiler's or the runtime's own words."""
+def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolchain.run) -> None:
+    """Fill `out` with what goes to a robot of `board`; UserError with the compiler's or the runtime's own words.
+
+    `run` says where the robot's code is compiled; what this computer needs to check it is always compiled here.
+    """
     paths.BUILD.mkdir(parents=True, exist_ok=True)
     with cache.exclusive(), progress.step(f"{subject.name} for {board.architecture}"):
         (out / "unit.d").mkdir(parents=True)  # what the app's service has beyond runtime/systemd/
         description = subject.description
         try:
             if isinstance(description, app.Make):
-                _make(subject, description, board.architecture, out)
+                _make(subject, description, board.architecture, out, run)
             elif isinstance(description, app.Ert):
                 with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".ert-") as work:
                     source = Path(work) / "source"
                     model, times_s = description.model, description.sample_times
                     app_ert.block(subject.directory, model, subject.name, times_s, source)
-                    _blocks(subject, source, ("-Wall",), board.architecture, out)
+                    _blocks(subject, source, ("-Wall",), board.architecture, out, run)
             elif isinstance(description, app.Fmu):
-                _fmu(subject, description, board.architecture, out)
+                _fmu(subject, description, board.architecture, out, run)
             else:
-                _blocks(subject, subject.directory, runtime.WARNINGS, board.architecture, out)
+                _blocks(subject, subject.directory, runtime.WARNINGS, board.architecture, out, run)
         except UserError as error:
             raise UserError(f"{paths.shown(subject.directory)}: nothing was deployed: {error}") from None
 
 
-def _blocks(subject: app.App, source: Path, options: Sequence[str], architecture: str, out: Path) -> None:
+def _blocks(
+    subject: app.App, source: Path, options: Sequence[str], architecture: str, out: Path, run: toolchain.Run
+) -> None:
     """The plug-in of all that is in `source`, and the task; the runtime judges both as the robot would."""
     task = subject.directory / app.TASK
     (out / "blocks").mkdir()
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".blocks-") as directory:
         if any(source.glob("*.c")):
-            plugin = runtime.compile_plugin(source, architecture, options)
+            plugin = runtime.compile_plugin(source, architecture, options, run)
             (out / "blocks" / f"{subject.name}.so").write_bytes(plugin)
             if architecture != "amd64":
                 plugin = runtime.compile_plugin(source, "amd64", options)
@@ -54,16 +59,16 @@ def _blocks(subject: app.App, source: Path, options: Sequence[str], architecture
     shutil.copyfile(task, out / app.TASK)
 
 
-def _fmu(subject: app.App, description: app.Fmu, architecture: str, out: Path) -> None:
+def _fmu(subject: app.App, description: app.Fmu, architecture: str, out: Path, run: toolchain.Run) -> None:
     """The unit, and the plug-in that calls it."""
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as work:
         unit = app_fmu.read(*app_fmu.unpacked(subject.directory, description.unit, Path(work) / "unit"))
         app_fmu.block(unit, subject.name, Path(work) / "source")
-        _blocks(subject, Path(work) / "source", runtime.WARNINGS, architecture, out)
-        app_fmu.build(unit, subject.name, architecture, out)
+        _blocks(subject, Path(work) / "source", runtime.WARNINGS, architecture, out, run)
+        app_fmu.build(unit, subject.name, architecture, out, run)
 
 
-def _make(subject: app.App, description: app.Make, architecture: str, out: Path) -> None:
+def _make(subject: app.App, description: app.Make, architecture: str, out: Path, run: toolchain.Run) -> None:
     """The program, and how its service differs from a task's."""
     safe = subject.directory / app.SAFE
     if safe.exists():
@@ -77,7 +82,7 @@ def _make(subject: app.App, description: app.Make, architecture: str, out: Path)
         # From the environment, because a Makefile may add to these; it cannot to what stands on make's command line.
         variables = ["CC=gcc", "AR=ar", "PKG_CONFIG=pkg-config", "CFLAGS=-O2 -I/out/include"]
         variables += ["LDFLAGS=-Wl,--build-id=none"]
-        runtime.command(Path(directory), architecture, ["env", "-C", "/out/source", *variables, "make"])
+        runtime.command(Path(directory), architecture, ["env", "-C", "/out/source", *variables, "make"], run)
         if not made.is_file():
             where = paths.shown(subject.directory / app.FILE)
             raise UserError(f"{where}: program: {description.program}: make does not make it; name what it makes")

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from images.builder import app, app_build, app_robot
+from images.builder import app, app_build, app_compiler, app_robot, toolchain
 from images.builder.errors import UserError
 from images.builder.fleet import Board
 
@@ -45,21 +45,24 @@ def command(to: app_robot.Connection, name: str, run: str) -> str:
     return RUNS[run](to, name)
 
 
-def deploy(to: app_robot.Connection, directory: Path, board: Board, *, keep: bool, show: app_robot.Show) -> str:
-    """Build the app and bring it to the robot. Then run it until it ends or KeyboardInterrupt ends it, and report; or,
-    to `keep` it, let it go on by itself, now and whenever the robot starts."""
+def deploy(
+    to: app_robot.Connection, directory: Path, board: Board, *, keep: bool, show: app_robot.Show, on_robot: bool = False
+) -> str:
+    """Build the app, here or on the robot, and bring it there. Then run it until it ends or KeyboardInterrupt ends it,
+    and report; or, to `keep` it, let it go on by itself, now and whenever the robot starts."""
     subject = app.load(directory)
     app.check_board(subject, to.robot, board)
-    place(to, subject, board)
+    place(to, subject, board, on_robot=on_robot)
     if not keep:
         return app_robot.run(to, subject.name, show)
     app_robot.keep(to, subject.name)
     return _start(to, subject.name)
 
 
-def place(to: app_robot.Connection, subject: app.App, board: Board) -> None:
+def place(to: app_robot.Connection, subject: app.App, board: Board, *, on_robot: bool = False) -> None:
     """Build the app and put it on the robot; it does not run."""
+    run = app_compiler.Compiler(to, subject.name).run if on_robot else toolchain.run
     with tempfile.TemporaryDirectory(prefix="flotilla-app-") as work:
         files = Path(work) / subject.name
-        app_build.build(subject, board, files)
+        app_build.build(subject, board, files, run)
         app_robot.send(to, subject, board, files)

@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 
 import jinja2
 
-from images.builder import app, paths, runtime
+from images.builder import app, paths, runtime, toolchain
 from images.builder.errors import Problem, UserError
 
 TEMPLATE = paths.PROJECT / "images" / "apps" / "fmu_block.c.j2"
@@ -431,12 +431,15 @@ def render(unit: Unit, name: str) -> str:
     return template.render(unit=unit, name=name, groups=_groups, functions=functions, file=file)
 
 
-def build(unit: Unit, name: str, architecture: str, out: Path) -> None:
-    """Fill `out` with the unit as a robot of an architecture needs it: its shared object, and its resources."""
+def build(unit: Unit, name: str, architecture: str, out: Path, run: toolchain.Run = toolchain.run) -> None:
+    """Fill `out` with the unit as a robot of an architecture needs it: its shared object, and its resources.
+
+    `run` says where sources are compiled.
+    """
     final = out / object_of(name)
     final.parent.mkdir(parents=True)
     if found := sources(unit, architecture):
-        final.write_bytes(_compiled(unit, found, architecture))
+        final.write_bytes(_compiled(unit, found, architecture, run))
         final.chmod(0o755)  # as linkers leave it
     else:
         place = binary(unit, architecture)
@@ -446,14 +449,15 @@ def build(unit: Unit, name: str, architecture: str, out: Path) -> None:
         shutil.copytree(unit.directory / "resources", final.parent.parent / "resources")
 
 
-def _compiled(unit: Unit, found: Sources, architecture: str) -> bytes:
+def _compiled(unit: Unit, found: Sources, architecture: str, run: toolchain.Run) -> bytes:
     """The unit's sources as a shared object."""
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as directory:
         tree = Path(directory) / "source"
         shutil.copytree(unit.directory / "sources", tree / "sources")
         shutil.copytree(HEADERS, tree / "fmi")
         options = ["-std=gnu17", "-Wall", "-Wl,-Bsymbolic,-z,defs", "-Isources", "-Ifmi", *found.options]
-        return runtime.compile_shared(tree, [f"sources/{name}" for name in found.files], architecture, options)
+        files = [f"sources/{name}" for name in found.files]
+        return runtime.compile_shared(tree, files, architecture, options, run)
 
 
 def _groups(variables: list[Variable]) -> dict[str, list[tuple[int, Variable]]]:

@@ -53,6 +53,24 @@ class Connection:
             raise self.error(done.returncode, done.stderr.decode(errors="replace"))
         return done.stdout.decode(errors="replace")
 
+    def stream(self, command: str, name: str, *arguments: str, stdin: Path, stdout: Path, log: Path) -> None:
+        """Run it between two files; what it says besides is shown as it comes, and kept in `log`."""
+        argv = [*boot.DIE_WITH_PARENT, *self.argv(command, name, *arguments)]
+        last = ""
+        with stdin.open("rb") as given, stdout.open("wb") as made, log.open("w") as kept:
+            said = subprocess.PIPE
+            with subprocess.Popen(argv, stdin=given, stdout=made, stderr=said, text=True, errors="replace") as process:
+                assert process.stderr
+                try:
+                    for last in process.stderr:
+                        kept.write(last)
+                        print(last, end="", file=sys.stderr, flush=True)
+                    process.wait()
+                finally:
+                    process.terminate()
+        if process.returncode:
+            raise self.error(process.returncode, f"{last.strip()}; what it said is above and in {paths.shown(log)}")
+
     def error(self, status: int, said: str) -> UserError:
         """Why something failed on the robot, or on the way."""
         name, said = self.robot.name, said.strip()

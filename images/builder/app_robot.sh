@@ -5,6 +5,7 @@ set -eu
 command=$1 name=$2
 shift 2
 apps=/data/apps
+compilers=/data/compilers
 unit=flotilla-app@$name.service
 system=/etc/systemd/system
 wants=$system/multi-user.target.wants/$unit
@@ -61,6 +62,69 @@ receive() {
     [ -z "$reload" ] || systemctl daemon-reload
 }
 
+# One build at a time; what an earlier one left that was cut off is removed.
+own_compilers() {
+    mkdir -p "$compilers"
+    exec 9<"$compilers"
+    flock -w 600 9 || refuse "another app has been compiling on it for ten minutes; nothing was changed"
+    rm -rf "$compilers/work" "$compilers/part"
+    trap 'rm -rf "$compilers/work" "$compilers/part"' EXIT
+}
+
+# Refuse when fewer than that many KiB are free, for a purpose.
+room() {
+    free=$(df --output=avail -k "$compilers" | tail -n 1)
+    [ "$free" -ge "$1" ] || refuse "/data has $((free)) KiB left, and $2 needs $1 KiB; compile on the development" \
+        "computer (without BUILD=remote), or remove something, such as another app; nothing was deployed"
+}
+
+# Take the compiler from standard input: its SHA-256, KiB that must be free. Earlier ones are of no more use.
+receive_compiler() {
+    own_compilers
+    rm -f "$compilers"/*.squashfs
+    room "$2" "the compiler"
+    cat >"$compilers/part"
+    [ "$(sha256sum <"$compilers/part")" = "$1  -" ] || refuse "the compiler did not arrive whole; try again"
+    sync "$compilers/part"
+    mv "$compilers/part" "$compilers/$1.squashfs"
+}
+
+# In namespaces that end with the command, and with them the mounts: IMAGE, WORK, the command. As nobody; the robot's
+# control goes before, and when memory is short it ends first.
+# shellcheck disable=SC2016 # another shell's
+enter_and_compile='
+image=$1 work=$2
+shift 2
+root=$work/root
+mount -o loop,ro,nosuid,nodev "$image" "$root"
+mount --bind "$work/out" "$root/out"
+mount --bind "$work/tmp" "$root/tmp"
+mount -t proc proc "$root/proc"
+mount -t tmpfs -o mode=755,nosuid tmpfs "$root/dev"
+for device in null zero full random urandom; do
+    : >"$root/dev/$device"
+    mount --bind "/dev/$device" "$root/dev/$device"
+done
+echo 1000 >/proc/self/oom_score_adj
+exec timeout 1800 nice -n 19 ionice -c 3 setpriv --no-new-privs chroot --userspec=65534:65534 "$root" "$@"
+'
+
+# Run a command of the compiler's root on files from standard input, which are /out; write them to standard output.
+# The compiler's SHA-256, KiB that must be free, the command. Of what it reaches nothing is the robot's.
+compile() {
+    image=$compilers/$1.squashfs need=$2 work=$compilers/work status=0
+    shift 2
+    own_compilers
+    room "$need" "compiling"
+    mkdir -p "$work/root" "$work/out" "$work/tmp"
+    tar -x --no-same-owner -C "$work/out"
+    chown -R 65534:65534 "$work/out" "$work/tmp"
+    unshare --mount --pid --fork --kill-child --net --ipc \
+        sh -euc "$enter_and_compile" compile "$image" "$work" "$@" </dev/null >&2 || status=$?
+    [ "$status" = 0 ] || refuse "it does not compile (status $status)"
+    tar -c -C "$work/out" .
+}
+
 there() {
     [ -e "$apps/$name" ] || refuse "there is no app $name; deploy it first"
 }
@@ -73,6 +137,15 @@ forget() {
 case $command in
 receive)
     receive "$@"
+    ;;
+has-compiler)
+    [ ! -e "$compilers/$1.squashfs" ] || echo yes
+    ;;
+receive-compiler)
+    receive_compiler "$@"
+    ;;
+compile)
+    compile "$@"
     ;;
 keep) # start it with the robot
     there

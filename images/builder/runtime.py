@@ -42,23 +42,27 @@ class Runtime:
         return package
 
 
-def command(work: Path, architecture: str, argv: Sequence[str]) -> None:
+def command(work: Path, architecture: str, argv: Sequence[str], run: toolchain.Run = toolchain.run) -> None:
     """Run a command among the locked compiler and libraries of an architecture; errors are its own words.
 
-    There, `work` is /out, and gets the public headers in /out/include.
+    There, `work` is /out, and gets the public headers in /out/include. `run` says where that is; so does it below.
     """
     shutil.copytree(SOURCE / "include", work / "include")
-    toolchain.run(f"runtime-{architecture}", work, argv, paths.BUILD / f"compile-{architecture}.log")
+    run(f"runtime-{architecture}", work, argv, paths.BUILD / f"compile-{architecture}.log")
 
 
-def compile_plugin(source: Path, architecture: str, options: Sequence[str] = WARNINGS) -> bytes:
+def compile_plugin(
+    source: Path, architecture: str, options: Sequence[str] = WARNINGS, run: toolchain.Run = toolchain.run
+) -> bytes:
     """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture."""
     files = sorted(file.name for file in source.glob("*.c")) if source.is_dir() else [source.name]
     options = ["-std=c11", *options, "-fvisibility=hidden", "-I/out/include"]
-    return compile_shared(source, files, architecture, options)
+    return compile_shared(source, files, architecture, options, run)
 
 
-def compile_shared(source: Path, files: Sequence[str], architecture: str, options: Sequence[str]) -> bytes:
+def compile_shared(
+    source: Path, files: Sequence[str], architecture: str, options: Sequence[str], run: toolchain.Run = toolchain.run
+) -> bytes:
     """A C file, or some of a directory, as a shared object for robots of an architecture.
 
     `files` and paths in `options` are relative to that directory.
@@ -71,7 +75,7 @@ def compile_shared(source: Path, files: Sequence[str], architecture: str, option
             (work / "source").mkdir()
             shutil.copy(source, work / "source")
         argv = ["env", "-C", "/out/source", "gcc", "-O2", "-shared", "-fPIC", "-s", "-Wl,--build-id=none", *options]
-        command(work, architecture, [*argv, "-o", "/out/plugin.so", *files, "-lm"])
+        command(work, architecture, [*argv, "-o", "/out/plugin.so", *files, "-lm"], run)
         return (work / "plugin.so").read_bytes()
 
 

@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from images.builder import namespace, paths, pool, tools
@@ -19,6 +19,8 @@ _ARCHITECTURES = {
     "amd64": ["-m64"],
 }
 """Options by Debian's name of the architecture. The oldest i386 boards are of the Pentium III class."""
+Run = Callable[[str, Path, Sequence[str], Path], None]
+"""Runs a command among the packages of a lock: `run`, or the same elsewhere."""
 _OPTIONS = ["-O2", "-Wl,--build-id=none", "-s"]
 
 

@@ -5,6 +5,7 @@ Building one and running it is tested on a guest, in tests/test_deploy.py.
 
 from __future__ import annotations
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -144,6 +145,37 @@ def test_what_goes_wrong_on_the_way_is_said(tmp_path: Path, status: int, stderr:
     with app_robot.connection(ROBOT, [str(script)]) as to, pytest.raises(UserError) as refused:
         app_deploy.command(to, "hover", "status")
     assert said in str(refused.value)
+
+
+def test_words_of_a_remote_compiler_are_shown_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script, log = tmp_path / "ssh", tmp_path / "log"
+    script.write_text("#!/bin/sh\ncat\nprintf 'a.c:1: error\\nit does not compile\\n' >&2\nexit 3\n")
+    script.chmod(0o755)
+    sent, made = tmp_path / "sent", tmp_path / "made"
+    sent.write_text("sources")
+    with pytest.raises(UserError, match=r"robot3: it does not compile; what it said is above and in .*log"):
+        app_robot.Connection(ROBOT, [str(script)]).stream("compile", "hover", stdin=sent, stdout=made, log=log)
+    assert made.read_text() == "sources"
+    assert log.read_text() == capsys.readouterr().err == "a.c:1: error\nit does not compile\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "build", "on_robot"),
+    [
+        (["BUILD=remote"], "build", True),
+        (["ON_ROBOT=1"], "build", True),
+        (["ON_ROBOT=1", "BUILD=other"], "other", True),
+        (["BUILD=other"], "other", False),
+        (["ON_ROBOT=0"], "build", False),
+    ],
+)
+def test_how_make_is_asked_for_a_remote_build(words: list[str], build: str, on_robot: bool) -> None:
+    """BUILD is the directory of all outputs, too."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("BUILD", "MAKEFLAGS")}
+    argv = ["make", "-n", "-C", str(paths.PROJECT), "deploy", "ROBOT=3", "APP=apps/hover", *words]
+    said = subprocess.run(argv, env=environment, capture_output=True, text=True, check=True).stdout
+    assert f"\n{build}/venv/bin/python -m images.builder deploy" in f"\n{said}"
+    assert ("--on-robot" in said) == on_robot
 
 
 def test_an_unknown_run() -> None:
