@@ -130,19 +130,21 @@ void fl_inner_text(struct fl_inner *inner, const char *parameter, const void *te
     }
 }
 
-static enum fl_kind kind_of(const struct fl_block_type *type, const char *parameter)
+/* NULL: fl_inner_start says that there is none. */
+static const struct fl_parameter *parameter_of(const struct fl_inner *inner, const char *name)
 {
-    for (uint32_t i = 0; i < type->parameter_count; i++)
-        if (strcmp(type->parameters[i].name, parameter) == 0)
-            return type->parameters[i].kind;
-    return FL_KIND_REAL; /* and fl_inner_start says that there is none */
+    char reason[256];
+    return parameter_find(inner->block->type, name, reason, sizeof reason);
 }
 
 void fl_inner_numbers(struct fl_inner *inner, const char *parameter, const double *values, size_t count)
 {
-    enum fl_kind kind = inner && inner->block ? kind_of(inner->block->type, parameter) : FL_KIND_REAL;
-    struct written *written = more(inner, parameter, kind == FL_KIND_REALS || count != 1, count);
-    for (size_t i = 0; written && i < count; i++) {
+    struct written *written = more(inner, parameter, count != 1, count);
+    if (!written)
+        return;
+    const struct fl_parameter *found = parameter_of(inner, parameter);
+    enum fl_kind kind = found ? found->kind : FL_KIND_REAL;
+    for (size_t i = 0; i < count; i++) {
         char text[32];
         snprintf(text, sizeof text, "%.17g", values[i]);
         if (kind == FL_KIND_BOOLEAN && (strcmp(text, "0") == 0 || strcmp(text, "1") == 0))
@@ -176,7 +178,7 @@ static bool set_parameters(struct fl_inner *inner)
     free(inner->written);
     inner->written = NULL;
     for (size_t i = 0; i < inner->tunable_count; i++)
-        inner->tuned[i] = parameter_find(inner->block->type, inner->tunable[i], (char[256]){0}, 256);
+        inner->tuned[i] = parameter_of(inner, inner->tunable[i]);
     return !problems.count;
 }
 
