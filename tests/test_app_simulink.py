@@ -311,8 +311,9 @@ FL_BLOCK(valve) = {.abi = FL_ABI, .name = "valve", .step = step, .safe = safe, .
 
 
 def test_an_inner_actuator_fails_and_is_reset_with_the_task(flotilla_run: Path, app: Path) -> None:
-    """Also by flotilla-run --safe, which follows a task that was killed. Seen to fail without `safe` in the template,
-    and without fl_inner_end: the model's terminate function knows nothing of the valve."""
+    """Also by flotilla-run --safe, which follows a task that was killed, and when a block that starts before it fails.
+    Seen to fail without each `fl_inner_safe` of the template, and without fl_inner_end: the model's terminate function
+    knows nothing of the valve."""
     generated, blocks = app / app_ert.GENERATED, app / "blocks"
     blocks.mkdir()
     (app / "valve.c").write_text(ACTUATOR_C)
@@ -345,3 +346,8 @@ def test_an_inner_actuator_fails_and_is_reset_with_the_task(flotilla_run: Path, 
     assert done.stderr.index("valve closed\n") < done.stderr.index("valve left\n")
     safe = subprocess.run([*argv, "--safe"], capture_output=True, text=True, timeout=60, check=False)
     assert (safe.returncode, safe.stderr) == (0, "valve closed\nvalve left\n")
+    file.write_text(TASK.format(parameters="AntiWindup: [1, 2, 3, 4, 5, 6, 7, 8]"))
+    broken = subprocess.run([*argv, "--safe"], capture_output=True, text=True, timeout=60, check=False)
+    assert broken.returncode == 1
+    assert broken.stderr.startswith("valve closed\nmodel: inner pid: parameters: "), "another block stops the reset"
+    assert broken.stderr.endswith("valve left\n")

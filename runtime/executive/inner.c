@@ -199,7 +199,7 @@ void fl_inner_ports(const struct fl_block *block, char *ports, size_t size)
 struct fl_block *inner_configure(struct fl_inner *inner)
 {
     struct fl_block *block = inner ? inner->block : NULL;
-    if (!block || !set_parameters(inner) || inner->outer->service->inner_failed)
+    if (!block || !set_parameters(inner))
         return NULL;
     const struct fl_block_type *type = block->type;
     if ((!type->configure || type->configure(block) == FL_OK) && block_make_signals(block) == FL_OK)

@@ -2,12 +2,13 @@
  * `flotilla-blocks --legacy-code` gave to Simulink (docs/apps.md).
  *
  * The block with the model, the outer one, brackets what it calls of the model:
- *   start        fl_inner_begin(block), the model's initialize function, then fl_inner_result(block)
+ *   start        fl_inner_begin(block), the model's initialize function, then fl_inner_result(block);
+ *                where that fails fl_inner_safe(block), which flotilla-run --safe leaves to it
  *   step         the model's step functions, then fl_inner_result(block)
  *   safe         fl_inner_safe(block)
  *   terminate    the model's terminate function, then fl_inner_end(block)
- * All failures of an inner block are the outer one's, whose memory and priority it has. After one its step does
- * nothing.
+ * Memory, priority and failures of an inner block are the outer one's. After a failure no step does anything; but what
+ * starts later starts, so that actuators can be reset whatever else is broken.
  */
 #ifndef FLOTILLA_INNER_H
 #define FLOTILLA_INNER_H
