@@ -35,8 +35,7 @@ def packed(lock: Lock) -> Path:
         pool.fill([lock, packer])
         tree = tools.tree(lock)
         with progress.step(f"{lock.name} packed"):
-            times = ["-mkfs-time", str(lock.epoch), "-all-time", str(lock.epoch), "-all-root"]
-            options = [*_COMPRESSION, *times, "-noappend", "-no-progress", "-wildcards", "-e", *_EXCLUDED]
+            options = [*_COMPRESSION, "-all-root", "-noappend", "-no-progress", "-wildcards", "-e", *_EXCLUDED]
             packing = tools.Tools(tools.tree(packer), lock.epoch)
             packing.run("usr/bin/mksquashfs", tree, out / "root.squashfs", *options)
 
