@@ -42,7 +42,7 @@ size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size --robot $(call need,ROBOT)
 
 ##@ Fleet
-.PHONY: fleet fleet-status fleet-down provision
+.PHONY: fleet fleet-status fleet-down fleet-scale provision
 fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
 	$(Q)$(PYTHON) -m tests.lab.fleet up $(call need,N)
 
@@ -51,6 +51,9 @@ fleet-status: | setup-tests ## what the guests of the virtual fleet do
 
 fleet-down: | setup-tests ## end the virtual fleet
 	$(Q)$(PYTHON) -m tests.lab.fleet down
+
+fleet-scale: | setup-tests ## how provisioning grows with the fleet, on light robots, as root: make fleet-scale N=32 [BOARD=]
+	$(Q)$(PYTHON) -m tests.lab.scale measure $(call need,N) $(if $(BOARD),--board $(BOARD))
 
 provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [ARGS=--check]
 	$(Q)cd ansible && export PATH="$(abspath $(VENV))/bin:$$PATH" BUILD="$(abspath $(BUILD))" && \

@@ -86,7 +86,7 @@ def up(count: int) -> None:
     for robot in robots:
         if not image_of(robot).exists():
             raise UserError(f"{paths.shown(image_of(robot))} is missing; build it: make image ROBOT={robot.number}")
-    if ports := _ports():
+    if ports := guest_ports():
         if len(ports) != count:
             raise UserError(f"a virtual fleet of {len(ports)} runs already; end it first: make fleet-down")
         _say(ports, "runs already")
@@ -103,17 +103,17 @@ def up(count: int) -> None:
             assert holder.stdout
             for number, _ in enumerate(holder.stdout, 1):  # a line for each that has booted
                 step.at(number, count, "guests")
-            if holder.poll() is not None or not _ports():
+            if holder.poll() is not None or not guest_ports():
                 raise UserError(f"the virtual fleet did not start; {paths.shown(_LOG)} says:\n{_LOG.read_text()}")
         except BaseException:
             holder.terminate()
             raise
-    _say(_ports(), f"runs on {fleet.network.subnet}")
+    _say(guest_ports(), f"runs on {fleet.network.subnet}")
 
 
 def status() -> str:
     """A line for each guest: uptime, state, tasks."""
-    ports = _ports()
+    ports = guest_ports()
     if not ports:
         return "no virtual fleet runs; start one: make fleet N=4"
     robots = [robot for robot in inventory.load_fleet().robots.values() if robot.name in ports]
@@ -196,7 +196,7 @@ def _end(*_: object) -> None:
     raise SystemExit("it was ended before it had started")
 
 
-def _ports() -> dict[str, int]:
+def guest_ports() -> dict[str, int]:
     """SSH ports of the running fleet's guests by robot; empty when none runs."""
     lock = _free_lock()
     if lock is not None:
