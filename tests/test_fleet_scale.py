@@ -32,7 +32,7 @@ DRIFT = {
     "rm -r /etc/systemd/system/multi-user.target.wants": "multi-user.target.wants was removed",
     "sysctl -q kernel.panic=0": "kernel.panic = 0, not 10",
     "nft flush ruleset": "the rules in force are others",
-    "systemctl stop chrony": "chrony.service does not run",
+    "systemctl stop nftables": "nftables.service does not run",
 }
 """What goes astray on robot 2, and how the report names it."""
 

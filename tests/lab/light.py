@@ -118,6 +118,7 @@ def boot(fleet: Fleet, robots: Sequence[Robot], image: Path, log: Path) -> None:
         if not _booted(told, first, deadline):
             said = (log / f"{robot.name}.log").read_text(errors="replace").strip()
             raise LabError(f"{robot.name} did not boot within {deadline.seconds:g} s, or ended; it said: {said}")
+        told.close()  # a socket that nobody reads would hold up its systemd at some later reload
         _run("ip", "link", "set", robot.name, "master", "fleet", "up")
     for robot in robots:
         _wait_for_ssh(robot.address, deadline)

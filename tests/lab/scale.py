@@ -25,7 +25,7 @@ from typing import Any
 
 import yaml
 
-from images.builder import errors, inventory, paths, progress
+from images.builder import cache, errors, inventory, paths, progress
 from images.builder.build import image_of
 from images.builder.errors import UserError
 from images.builder.fleet import Fleet
@@ -254,15 +254,16 @@ def run(count: int, board: str | None) -> None:
     fleet = inventory.load_fleet()
     board = board or next(iter(fleet.robots.values())).board
     image = image_for(fleet, board)
-    describe(count, board, DIRECTORY / "inventory")  # complains where it cannot be
-    light.clean()
-    there = guests()
-    samples: list[Sample] = []
-    for each in sorted({count >> shift for shift in range(count.bit_length())}):
-        with progress.step(f"fleet.yml on {each} robots"):
-            samples.append(measure(each, board, image))
-    result = {"board": board} | summary(samples, there)
-    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    with cache.locked(DIRECTORY / "lock"):
+        describe(count, board, DIRECTORY / "inventory")  # complains where it cannot be
+        light.clean()
+        there = guests()
+        samples: list[Sample] = []
+        for each in sorted({count >> shift for shift in range(count.bit_length())}):
+            with progress.step(f"fleet.yml on {each} robots"):
+                samples.append(measure(each, board, image))
+        result = {"board": board} | summary(samples, there)
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
     print(f"{table(result)}\n{paths.shown(RESULT)}")
 
 
