@@ -170,16 +170,16 @@ param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=headin
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck scenarios scenarios-accept
 LATENCY = $(PYTHON) -m tests.latency
-# What is measured: the board's shipped system, or another kernel of it, or less of it, or a robot.
+# What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.
 measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--plan $(PLAN))
-latency: | setup-tests ## latency in virtual time against the accepted one [BOARD= KERNEL= PLAN=quick|disk]; or TARGET=ssh:robot3
+latency: | setup-tests ## latency in virtual time within its limits, a control refused [BOARD= KERNEL=lean|debian|no-rt PLAN=quick|disk]; or TARGET=ssh:robot3
 	$(Q)$(LATENCY) measure $(measured) $(if $(TARGET),--target $(TARGET))
 	$(if $(TARGET),,$(Q)$(LATENCY) compare $(measured))
 
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
 	$(Q)$(FLOTILLA) hwcheck --robot $(call need,ROBOT) $(if $(SECONDS),--seconds $(SECONDS))
 
-latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and make that the accepted latency [BOARD= PLAN=]
+latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and make that the accepted latency [BOARD=]
 	$(Q)$(LATENCY) accept $(measured)
 
 boot-time: | setup-tests ## where a boot spends its time, in virtual time

@@ -12,7 +12,8 @@ from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
 from tests.lab.perturb import perturbed_host
 from tests.latency import gate, machine, run, subject
-from tests.latency.controls import DELAY_US, Control
+from tests.latency.controls import DELAY_US, NO_RT, Control
+from tests.latency.limits import LOADED
 from tests.latency.results import Latency, Results
 
 pytestmark = pytest.mark.boot
@@ -60,9 +61,13 @@ def test_a_run_repeats_to_the_byte_however_the_host_schedules(
     [
         (Control(delay="irq"), "idle", DELAY_US, ["the timer found irq_test in", "preemptirqtest"]),
         (Control(delay="preempt"), "idle", DELAY_US, ["the timer found preempt_test in", "preemptirqtest"]),
+        pytest.param(
+            NO_RT, "scheduler", LOADED.at_most_us, ["the kernel is without PREEMPT_RT", "the timer found "],
+            marks=pytest.mark.long,  # a kernel of its own
+        ),
     ],
-    ids=["interrupts-off", "preemption-off"],
-)
+    ids=["interrupts-off", "preemption-off", "no-real-time"],
+)  # fmt: skip
 def test_gate_catches_a_fault_and_names_it(
     measured: Callable[[str], Results], boards: dict[str, Board], artefacts: Path,
     control: Control, scenario: str, late_us: int, named: list[str],
@@ -80,6 +85,20 @@ def test_gate_catches_a_fault_and_names_it(
     assert after > max(2 * before, late_us)
     for words in named:
         assert words in said
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_latency_with_a_disk_is_bounded(boards: dict[str, Board], artefacts: Path, kernel: str) -> None:
+    found = run.measure(boards[kernel], "disk", artefacts)
+    assert gate.check(found, artefacts / "none") == "every latency with a disk is within its bound"
+
+
+@pytest.mark.long
+def test_a_bound_notices_a_fault(boards: dict[str, Board], artefacts: Path) -> None:
+    found = run.measure(boards["lean"], "disk", artefacts, Control(delay="irq"))
+    with pytest.raises(UserError, match=r"disk: wake-up: max .* is the bound"):
+        gate.check(found, artefacts / "none")
 
 
 def test_the_loads_are_loads(measured: Callable[[str], Results]) -> None:

@@ -4,15 +4,55 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import get_args
 
-from images.builder import inventory, paths
+from images.builder import inventory, kernel, paths
 from images.builder.errors import UserError, exit_status
 from images.builder.fleet import Board
-from tests.latency import boottime, gate, report, results, run, target
+from tests.latency import boottime, controls, gate, limits, report, results, run, target
+from tests.latency.results import Plan, Results
 
 REPORTS = paths.BUILD / "reports"
 KERNELS = ("lean", "debian")
+CONTROL = "no-rt"
+"""The kernel `lean` without real time: what the gate has to refuse."""
+
+
+@dataclass(frozen=True)
+class System:
+    """What is measured, and by what plan."""
+
+    board: Board
+    plan: Plan
+    control: controls.Control
+
+    @property
+    def directory(self) -> Path:
+        return run.directory(self.board, self.plan, self.control)
+
+    def results(self) -> Results:
+        path = self.directory / "results.json"
+        if not path.exists():
+            raise UserError(f"{paths.shown(path)} is missing; measure first: make latency")
+        return results.read(path)
+
+
+def _systems(arguments: argparse.Namespace) -> list[System]:
+    """The one that is asked for, or both kernels and the control."""
+    board = _board(arguments)
+    if arguments.kernel:
+        return [_system(board, arguments.plan, arguments.kernel)]
+    there = arguments.plan != "disk" and f"{board.name}-{CONTROL}" in kernel.recipes()
+    return [_system(board, arguments.plan, name) for name in (*KERNELS, *([CONTROL] if there else []))]
+
+
+def _system(board: Board, plan: Plan, name: str) -> System:
+    if name == CONTROL:  # five seconds show it, and there is an accepted run of the kernel that it deviates from
+        return System(board.model_copy(update={"kernel": limits.OURS}), "quick", controls.NO_RT)
+    return System(board.model_copy(update={"kernel": name}), plan, controls.NOTHING)
 
 
 def _board(arguments: argparse.Namespace) -> Board:
@@ -20,7 +60,7 @@ def _board(arguments: argparse.Namespace) -> Board:
     name = arguments.board
     if name not in boards:
         raise UserError(f"--board {name}: there is no such board; the inventory has {', '.join(sorted(boards))}")
-    return boards[name].model_copy(update={"kernel": arguments.kernel} if arguments.kernel else {})
+    return boards[name]
 
 
 def _measure(arguments: argparse.Namespace) -> None:
@@ -31,8 +71,8 @@ def _measure(arguments: argparse.Namespace) -> None:
             out = paths.BUILD / "latency" / f"{robot.name}-{arguments.plan}"
             target.measure(robot, fleet.boards[robot.board], shell, arguments.plan, out)
     else:
-        board = _board(arguments)
-        run.measure(board, arguments.plan, run.directory(board, arguments.plan))
+        for system in _systems(arguments):
+            run.measure(system.board, system.plan, system.directory, system.control)
     _report(arguments)
 
 
@@ -45,34 +85,53 @@ def _report(_: argparse.Namespace) -> None:
 
 def _boot_time(arguments: argparse.Namespace) -> None:
     board = _board(arguments)
-    text = boottime.account(boottime.measure(board, paths.BUILD / "latency" / f"{run.name(board, 'standard')}-boot"))
+    if arguments.kernel:
+        board = board.model_copy(update={"kernel": arguments.kernel})
+    out = paths.BUILD / "latency" / f"{board.name}-{board.kernel}-boot"
+    text = boottime.account(boottime.measure(board, out))
     REPORTS.mkdir(parents=True, exist_ok=True)
-    (REPORTS / f"boot-time-{run.name(board, 'standard')}.txt").write_text(text + "\n")
+    (REPORTS / f"boot-time-{board.name}-{board.kernel}.txt").write_text(text + "\n")
     print(text)
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    board = _board(arguments)
-    path = run.directory(board, arguments.plan) / "results.json"
-    if not path.exists():
-        raise UserError(f"{paths.shown(path)} is missing; measure first: make latency")
-    print(gate.check(results.read(path), gate.baseline(board, arguments.plan)))
+    """Everything is judged, whatever is said of the first."""
+    long = [system.results() for system in _systems(arguments) if system.plan == "standard"]
+    judged = [partial(_judge, system) for system in _systems(arguments) if system.plan != "standard"]
+    refused = []
+    for judge in [*judged, partial(limits.check, long)] if long else judged:
+        try:
+            print(judge())
+        except UserError as error:
+            refused.append(str(error))
+    if refused:
+        raise UserError("\n".join(refused))
+
+
+def _judge(system: System) -> str:
+    found = system.results()
+    if system.control == controls.NOTHING:
+        return gate.check(found, gate.baseline(system.board, system.plan))
+    return f"{gate.check_control(found)}\n{limits.check_control(found)}"
 
 
 def _accept(arguments: argparse.Namespace) -> None:
     """Anew, not the last run: so it is of the system as it is now, and one command does for both kernels."""
-    if arguments.plan == "disk":
-        raise UserError("--plan disk: has bounds, not a baseline: tests/latency/scenarios.py")
-    for kernel in [arguments.kernel] if arguments.kernel else KERNELS:
-        board = _board(argparse.Namespace(board=arguments.board, kernel=kernel))
-        file = gate.baseline(board, arguments.plan)
-        gate.accept(run.measure(board, arguments.plan, run.directory(board, arguments.plan)), file)
+    if arguments.plan != "quick":
+        raise UserError(f"--plan {arguments.plan}: has limits, not an accepted run; only quick has one")
+    for name in [arguments.kernel] if arguments.kernel else KERNELS:
+        system = _system(_board(arguments), arguments.plan, name)
+        file = gate.baseline(system.board, system.plan)
+        gate.accept(run.measure(system.board, system.plan, system.directory), file)
         print(f"{paths.shown(file)} is what was measured; commit it with the reason for the difference")
 
 
 _COMMANDS = {
     "measure": (_measure, "measure a board's system in virtual time, and write the report"),
-    "compare": (_compare, "compare the last run with the accepted one: exactly"),
+    "compare": (
+        _compare,
+        "judge the last runs: by limits, or exactly by the accepted run; the control has to be refused",
+    ),
     "accept": (_accept, "measure, and make that the accepted run; both kernels, unless one is named"),
     "report": (_report, "write the report of all runs there are"),
     "boot-time": (_boot_time, "boot once in virtual time, and say where it goes"),
@@ -85,13 +144,14 @@ def main() -> int:
     for name, (_, text) in _COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("--board", default="smartcoret3", help="name in the inventory (%(default)s)")
-        command.add_argument("--kernel", choices=KERNELS, help="instead of the one the inventory names")
+        known = (*KERNELS, CONTROL) if name in ("measure", "compare") else KERNELS
+        command.add_argument("--kernel", choices=known, help="this one only")
         if name == "measure":
             command.add_argument("--target", metavar="ssh:ROBOT", help="a robot in real time, instead of virtual time")
         default = "quick" if name == "accept" else "standard"
         command.add_argument(
             "--plan", choices=get_args(results.Plan), default=default,
-            help="standard, a minute each; quick, what every test run measures; disk, bounded only (%(default)s)",
+            help="standard, a minute each, with limits; quick, what tests measure; disk, bounded (%(default)s)",
         )  # fmt: skip
     arguments = parser.parse_args()
     return exit_status(lambda: _COMMANDS[arguments.command][0](arguments))

@@ -22,7 +22,8 @@ class Control:
     """What is wrong with the system that is measured; by default nothing."""
 
     kernel: str | None = None
-    """Of kernels.yml, instead of the system's own. The root's modules are not for it: what it has built in must do."""
+    """Instead of the system's own, `BOARD-kernel` of kernels.yml. The root's modules are not for it: what it has built
+    in must do."""
     delay: Literal["irq", "preempt"] | None = None
     """What the kernel's own test module switches off for DELAY_US at a time: interrupts or preemption."""
 
@@ -46,3 +47,5 @@ class Control:
 
 
 NOTHING = Control()
+NO_RT = Control(kernel="no-rt")
+"""The same kernel without PREEMPT_RT."""

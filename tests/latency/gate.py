@@ -12,11 +12,14 @@ from images.builder import paths
 from images.builder.errors import UserError
 from images.builder.fleet import Board
 from tests.latency import run, trace
+from tests.latency.limits import OURS
 from tests.latency.results import Latency, Outcome, Plan, Results, read
 from tests.latency.scenarios import SCENARIOS
 
 BASELINES = Path(__file__).parent / "baselines"
 ACCEPT = "make latency-accept"
+_REAL_TIME = "PREEMPT_RT"
+"""What such a kernel calls itself, in `uname -v`."""
 _MEANING = {
     "kernel": "another kernel",
     "root": "another root file system",
@@ -29,7 +32,12 @@ _MEANING = {
 
 def baseline(board: Board, plan: Plan) -> Path:
     """Where the accepted run is kept."""
-    return BASELINES / f"{run.name(board, plan)}.json"
+    return BASELINES / f"{run.name(board.name, board.kernel, plan)}.json"
+
+
+def baseline_of_control(found: Results) -> Path:
+    """That of the kernel which the control's deviates from."""
+    return BASELINES / f"{run.name(found.board, OURS, found.plan)}.json"
 
 
 def compare(found: Results, baseline: Results) -> list[str]:
@@ -58,6 +66,8 @@ def causes(found: Results, baseline: Results) -> list[str]:
     ]
     if (was := f"{baseline.release} {baseline.version}") != (now := f"{found.release} {found.version}"):
         differing.append(f"uname: {was} → {now}")
+    if _REAL_TIME in baseline.version and _REAL_TIME not in found.version:
+        differing.append(f"the kernel is without {_REAL_TIME}: what it does for one process, no other one interrupts")
     return differing
 
 
@@ -72,23 +82,43 @@ def check(found: Results, file: Path) -> str:
     """A sentence when the run equals the accepted one in `file`; otherwise everything that moved, as a UserError."""
     if found.plan == "disk":
         return _check_bounds(found)
+    baseline = accepted(file)
+    if said := refusal(found, baseline):
+        raise UserError(
+            f"latency is not that of {paths.shown(file)}:\n  {said}\n"
+            f"`make latency` shows the distributions; if this is meant: {ACCEPT}"
+        )
+    differing = causes(found, baseline)
+    aside = f", although there is\n  {_lines(differing)}" if differing else ""
+    return f"every figure is that of {paths.shown(file)}{aside}"
+
+
+def check_control(found: Results) -> str:
+    """What the gate says of a system with a fault, when it refuses that; a UserError when it does not."""
+    if said := refusal(found, accepted(baseline_of_control(found))):
+        return f"{found.board}, {found.kernel}: refused, as it has to be:\n  {said}"
+    raise UserError(f"{found.board}, {found.kernel}: the negative control passes, so the gate notices nothing")
+
+
+def accepted(file: Path) -> Results:
+    """The run in a file that has to be there."""
     if not file.exists():
         raise UserError(f"{paths.shown(file)} is missing: nothing to compare with; make it from this run: {ACCEPT}")
-    baseline = read(file)
+    return read(file)
+
+
+def refusal(found: Results, baseline: Results) -> str:
+    """What moved, and why, as far as the two runs tell; empty when every figure is the same."""
     moved = compare(found, baseline)
-    differing = causes(found, baseline)
     if not moved:
-        aside = f", although there is\n  {_lines(differing)}" if differing else ""
-        return f"every figure is that of {paths.shown(file)}{aside}"
+        return ""
+    differing = causes(found, baseline)
     likely = f"likely cause:\n  {_lines(differing)}" if differing else (
         "kernel, root, measurement, machine, QEMU and BIOS are the same: the run did not repeat, which is a defect"
     )  # fmt: skip
     if named := traced(found, baseline):
         likely += f"\nthe kernel's trace of the latest sample:\n  {_lines(named)}"
-    raise UserError(
-        f"latency is not that of {paths.shown(file)}:\n  {_lines(moved)}\n{likely}\n"
-        f"`make latency` shows the distributions; if this is meant: {ACCEPT}"
-    )
+    return f"{_lines(moved)}\n{likely}"
 
 
 def _check_bounds(found: Results) -> str:

@@ -11,7 +11,8 @@ from typing import get_args
 
 import jinja2
 
-from tests.latency import trace
+from tests.latency import gate, limits, trace
+from tests.latency.controls import NO_RT
 from tests.latency.results import Latency, Outcome, Plan, Results
 from tests.latency.run import VIRTUAL
 from tests.latency.scenarios import SCENARIOS
@@ -131,8 +132,21 @@ def render(runs: Sequence[Results]) -> str:
     )
     environment.filters |= {"zip": zip, "cause": trace.cause}
     return environment.get_template("report.html.j2").render(
-        runs=[(label(run), run) for run in runs], charts=charts(runs), rows=rows(runs)
+        runs=[(label(run), run) for run in runs],
+        charts=charts(runs),
+        rows=rows(runs),
+        verdicts=limits.judge(runs),
+        refusals=refusals(runs),
     )
+
+
+def refusals(runs: Sequence[Results]) -> dict[str, str]:
+    """What the gate says of negative controls, by their labels."""
+    return {
+        label(run): gate.refusal(run, gate.accepted(gate.baseline_of_control(run)))
+        for run in runs
+        if run.kernel == NO_RT.kernel
+    }
 
 
 def rows(runs: Sequence[Results]) -> list[Row]:

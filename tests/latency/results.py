@@ -121,7 +121,7 @@ class Results(_Model):
     format: Literal[1] = 1
     board: str
     kernel: str
-    """`debian` or `lean`."""
+    """`debian` or `lean`, or a control's."""
     plan: Plan
     where: str
     """`virtual time`, or the robot."""

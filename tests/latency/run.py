@@ -21,14 +21,14 @@ _LIMIT_PER_SECOND = 30
 """Of the host's clock, for each virtual second: finite, and generous to a busy host."""
 
 
-def directory(board: Board, plan: Plan) -> Path:
+def directory(board: Board, plan: Plan, control: Control = NOTHING) -> Path:
     """Where a run leaves `results.json`, `raw-N` for each boot, and `console.log` and `qemu.command` of the last."""
-    return paths.BUILD / "latency" / name(board, plan)
+    return paths.BUILD / "latency" / name(board.name, control.kernel or board.kernel, plan)
 
 
-def name(board: Board, plan: Plan) -> str:
-    """`smartcoret3-debian`, `smartcoret3-debian-quick`."""
-    return f"{board.name}-{board.kernel}" + ("" if plan == "standard" else f"-{plan}")
+def name(board: str, kernel: str, plan: Plan) -> str:
+    """`smartcoret3-debian`, `smartcoret3-debian-quick`, `smartcoret3-no-rt-quick`."""
+    return f"{board}-{kernel}" + ("" if plan == "standard" else f"-{plan}")
 
 
 def planned(plan: Plan) -> list[Scenario]:
@@ -39,7 +39,7 @@ def planned(plan: Plan) -> list[Scenario]:
 
 def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING) -> Results:
     """Measure a board's system; `results.json` is in `out` when it is done. `control`: what is wrong with it."""
-    measured = subject.build(board, control.kernel)
+    measured = subject.build(board, control.kernel and f"{board.name}-{control.kernel}")
     emulator = machine.emulator()
     out.mkdir(parents=True, exist_ok=True)
     boots: dict[tuple[str, ...], list[Scenario]] = {}
@@ -56,7 +56,7 @@ def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING) -> 
         guest = machine.Machine(emulator, board, measured.kernel, initrd, measured.arguments(without), disk)
         commands.append(machine.without_paths(guest.command_line(Path("/c"), Path("/r"))))
         seconds = sum(SECONDS[plan] * scenario.share for scenario in scenarios)
-        title = " without ".join([f"latency of {name(board, plan)}", *without])
+        title = " without ".join([f"latency of {name(board.name, control.kernel or board.kernel, plan)}", *without])
         with progress.step(f"{title}: {len(scenarios)} scenarios, {seconds:g} virtual seconds"):
             content = guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds)
         initrd.unlink()
@@ -70,6 +70,8 @@ def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING) -> 
         firmware=emulator.version("seabios"),
     )
     found = results_of(board, plan, binding, documents, planned(plan), VIRTUAL)
+    if control.kernel:
+        found = found.model_copy(update={"kernel": control.kernel})
     (out / "results.json").write_text(found.text())
     return found
 

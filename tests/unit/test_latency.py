@@ -14,7 +14,21 @@ import pytest
 from images.builder import inventory, paths
 from images.builder.errors import UserError
 from images.builder.lock import read_lock
-from tests.latency import boottime, controls, gate, machine, report, results, run, subject, target, timerlat, trace
+from tests.latency import __main__ as command
+from tests.latency import (
+    boottime,
+    controls,
+    gate,
+    limits,
+    machine,
+    report,
+    results,
+    run,
+    subject,
+    target,
+    timerlat,
+    trace,
+)  # fmt: skip
 from tests.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
 from tests.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
 
@@ -234,6 +248,105 @@ def test_with_a_disk_there_are_bounds_only(tmp_path: Path) -> None:
     beyond = within.model_copy(update={"scenarios": {"disk-idle": idle}})
     with pytest.raises(UserError, match="disk-idle: wake-up: max 151 µs, and 150 µs is the bound"):
         gate.check(beyond, tmp_path / "none")
+
+
+def test_a_kernel_that_lost_its_real_time_is_named() -> None:
+    accepted = made().model_copy(update={"version": "#1 PREEMPT_RT"})
+    assert "the kernel is without PREEMPT_RT" in gate.refusal(made(histogram={46: 1}, kernel="b" * 64), accepted)
+    assert "without PREEMPT_RT" not in gate.refusal(made(histogram={46: 1}, kernel="b" * 64), made())
+
+
+def test_a_control_has_to_be_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "BASELINES", tmp_path)
+    control = made().model_copy(update={"kernel": "no-rt", "plan": "quick"})
+    gate.accept(control, tmp_path / "board-lean-quick.json")
+    with pytest.raises(UserError, match="board, no-rt: the negative control passes, so the gate notices nothing"):
+        gate.check_control(control)
+    changed = control.model_copy(update={"scenarios": made(histogram={46: 1}).scenarios})
+    assert gate.check_control(changed).startswith("board, no-rt: refused, as it has to be:\n  idle: wake-up: ")
+    page = report.render([changed])
+    assert "board, no-rt (quick): refused" in page
+    assert "NOT REFUSED" in report.render([control])
+
+
+# The limits
+
+
+def long(kernel: str, latest_us: dict[str, int], **changes: Any) -> Results:
+    """A long run in which each scenario's latest wake-up is as told."""
+    scenarios = {
+        name: Outcome(title=name, latencies={"wake-up": Latency.of({20: 9, us: 1})}) for name, us in latest_us.items()
+    }
+    return made(**changes).model_copy(update={"kernel": kernel, "scenarios": scenarios})
+
+
+DEBIAN = long("debian", {"idle": 80, "cpu": 100, "everything": 120})
+
+
+def test_limits_hold_up_to_the_limit() -> None:
+    said = limits.check([long("lean", {"idle": 40, "cpu": 60, "everything": 59}), DEBIAN])
+    assert said.splitlines() == [
+        "board, lean, idle: at most 40 µs: 40 µs (idle): holds",
+        "board, lean, idle: at most 0.5 of debian's: 40 µs (idle) to 80 µs (idle): holds",
+        "board, lean, under any load: at most 60 µs: 60 µs (cpu): holds",
+        "board, lean, under any load: at most 0.5 of debian's: 60 µs (cpu) to 120 µs (everything): holds",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("latest_us", "broken"),
+    [
+        ({"idle": 41, "cpu": 50}, ["idle: at most 40 µs: 41 µs", "idle: at most 0.5 of debian's: 41 µs"]),
+        ({"idle": 30, "cpu": 61}, ["load: at most 60 µs: 61 µs", "load: at most 0.5 of debian's: 61 µs"]),
+    ],
+)
+def test_beyond_a_limit_is_refused(latest_us: dict[str, int], broken: list[str]) -> None:
+    with pytest.raises(UserError, match=r"limits\.py") as caught:
+        limits.check([long("lean", latest_us), DEBIAN])
+    refused = [line for line in str(caught.value).splitlines() if line.endswith("DOES NOT HOLD")]
+    assert len(refused) == len(broken)
+    assert all(text in line for text, line in zip(broken, refused, strict=True))
+    page = report.render([long("lean", latest_us), DEBIAN])
+    assert page.count("does not hold") == len(broken)
+
+
+def test_limits_are_of_our_kernel_in_long_runs_on_one_machine() -> None:
+    late = {"idle": 500}
+    assert limits.judge([long("debian", late), made()]) == []
+    assert limits.judge([long("lean", late).model_copy(update={"plan": "quick"})]) == []
+    assert [verdict.holds for verdict in limits.judge([long("lean", late)])] == [False]
+    with pytest.raises(UserError, match="lean and debian were not measured alike: they differ in qemu"):
+        limits.judge([long("lean", late, qemu="8.0"), DEBIAN])
+
+
+def test_a_control_has_to_be_beyond_the_limit() -> None:
+    assert limits.check_control(long("no-rt", {"scheduler": 61})).endswith("refused, as it has to be")
+    with pytest.raises(UserError, match="the negative control passes, so the limit notices nothing"):
+        limits.check_control(long("no-rt", {"scheduler": 60}))
+
+
+@pytest.mark.parametrize(("latest_us", "control_us", "status"), [(60, 300, 0), (61, 300, 1), (60, 45, 1)])
+def test_command_judges_both_kernels_and_the_control(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    latest_us: int, control_us: int, status: int,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(paths, "BUILD", tmp_path)
+    monkeypatch.setattr(gate, "BASELINES", tmp_path)
+    accepted = long("lean", {"scheduler": 45}).model_copy(update={"board": "smartcoret3", "plan": "quick"})
+    gate.accept(accepted, tmp_path / "smartcoret3-lean-quick.json")
+    control = long("no-rt", {"scheduler": control_us}).model_copy(update={"plan": "quick"})
+    for run_, name in (
+        (long("lean", {"idle": 40, "cpu": latest_us}), "lean"), (DEBIAN, "debian"), (control, "no-rt-quick"),
+    ):  # fmt: skip
+        file = tmp_path / "latency" / f"smartcoret3-{name}" / "results.json"
+        file.parent.mkdir(parents=True)
+        file.write_text(run_.model_copy(update={"board": "smartcoret3"}).text())
+    monkeypatch.setattr("sys.argv", ["latency", "compare"])
+    assert command.main() == status
+    said = capsys.readouterr()
+    whole = said.out + said.err
+    assert f"under any load: at most 60 µs: {latest_us} µs (cpu)" in whole
+    assert ("the negative control passes, so the gate notices nothing" in whole) == (control_us == 45)
 
 
 def test_a_damaged_baseline_is_named(tmp_path: Path) -> None:
