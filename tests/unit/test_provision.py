@@ -42,7 +42,8 @@ def test_what_no_role_looks_after_is_an_error() -> None:
 def test_every_role_is_there_and_played() -> None:
     named = set(yaml.safe_load(provision.ROLES.read_text()))
     (play,) = yaml.safe_load((paths.PROJECT / "ansible" / "fleet.yml").read_text())
-    assert named == set(play["roles"]) == {path.name for path in ROLES.iterdir()}
+    (mended,) = play["tasks"]
+    assert named == set(mended["loop"]) == {path.name for path in ROLES.iterdir()}
     assert all((ROLES / name / "meta" / "argument_specs.yml").exists() for name in named)
 
 
