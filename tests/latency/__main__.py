@@ -112,7 +112,7 @@ def _judge(system: System) -> str:
     found = system.results()
     if system.control == controls.NOTHING:
         return gate.check(found, gate.baseline(system.board, system.plan))
-    return f"{gate.check_control(found)}\n{limits.check_control(found)}"
+    return gate.check_control(found)
 
 
 def _accept(arguments: argparse.Namespace) -> None:

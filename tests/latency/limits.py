@@ -113,12 +113,3 @@ def check(runs: Sequence[Results]) -> str:
     if all(verdict.holds for verdict in verdicts):
         return text
     raise UserError(f"{text}\nlimits and their reasons are in tests/latency/limits.py")
-
-
-def check_control(run: Results) -> str:
-    """A sentence when a kernel without real time is beyond the limit; when it is not, the limit is worth nothing."""
-    late_us, where = LOADED.worst(run)
-    text = f"{run.board}, {run.kernel}, {LOADED.title}: {late_us} µs ({where}), {LOADED.at_most_us} µs are allowed"
-    if late_us > LOADED.at_most_us:
-        return f"{text}: refused, as it has to be"
-    raise UserError(f"{text}: the negative control passes, so the limit notices nothing")

@@ -31,6 +31,9 @@ _PROGRAMS = {"i386": "usr/libexec/qemu-system-i386", "x86_64": "usr/bin/qemu-sys
 """By the board's `qemu.system`; Debian's usr/bin/qemu-system-i386 is a script that starts the former."""
 
 
+_ISA = ("ttyS0", "ttyS1", "ttyS2", "ttyS3")
+
+
 @dataclass(frozen=True)
 class Emulator:
     """QEMU as the lock `emulator` has it, run from where it is unpacked: the same one on every computer."""
@@ -78,9 +81,11 @@ class Machine:
     """Further arguments of QEMU, such as devices that the board does not have by itself."""
     shift: int = 3
     """An instruction takes 2**shift ns of virtual time."""
+    modules: bool = True
+    """Whether the root's modules are the kernel's."""
 
     def run(self, directory: Path, timeout_s: float) -> bytes:
-        """What the guest wrote to its last serial connector; `console.log` and `qemu.command` stay in `directory`.
+        """What the guest wrote to its `results_port`; `console.log` and `qemu.command` stay in `directory`.
 
         `timeout_s`: seconds of the host's clock.
         """
@@ -110,10 +115,9 @@ class Machine:
             argv += ["-blockdev", json.dumps(drive), "-device", "ide-hd,drive=disk,bus=ide.0,unit=0"]
         argv += ["-chardev", qemu.chardev("console", _file(console)), *["-serial", "none"] * int(board.console.tty[4:])]
         argv += ["-serial", "chardev:console"]
-        *silent, last = qemu.port_ids(board).values()
-        for identifier in silent:
-            argv += ["-chardev", qemu.chardev(identifier, qemu.NULL)]
-        argv += ["-chardev", qemu.chardev(last, _file(results))]
+        for name, identifier in qemu.port_ids(board).items():
+            end = _file(results) if name == results_port(board, modules=self.modules) else qemu.NULL
+            argv += ["-chardev", qemu.chardev(identifier, end)]
         for device in board.qemu.devices:
             argv += ["-device", device]
         return [*argv, *self.extra]
@@ -124,8 +128,8 @@ def card_command_line(emulator: Emulator, board: Board, card: Path, console: Pat
 
     While the guest waits for the disk, the clock goes as the host's: skipping that time would count it many times over.
     """
-    last = list(qemu.port_ids(board))[-1]
-    options = qemu.Options(console=_file(console), ports={last: _file(results)}, reboot=False, virtual_time=True)
+    ports = {results_port(board): _file(results)}
+    options = qemu.Options(console=_file(console), ports=ports, reboot=False, virtual_time=True)
     argv = qemu.command_line(board, card, options)[1:]
     return [*emulator.command(board), *(word.replace(",sleep=off", ",sleep=on") for word in argv)]
 
@@ -156,10 +160,13 @@ def execute(emulator: Emulator, argv: list[str], directory: Path, timeout_s: flo
     return content
 
 
-def results_tty(board: Board) -> str:
-    """Kernel name of the connector whose output is `results`: the last one, which nothing else is plugged into."""
-    last = list(qemu.port_ids(board))[-1]
-    return board.ports[last].tty
+def results_port(board: Board, *, modules: bool = True) -> str:
+    """The connector whose output is `results`: the last one, which nothing else is plugged into.
+
+    Without modules, the last of those whose driver every kernel has built in.
+    """
+    names = list(qemu.port_ids(board))
+    return names[-1] if modules else [name for name in names if board.ports[name].tty in _ISA][-1]
 
 
 def without_paths(argv: Sequence[str]) -> str:

@@ -11,6 +11,7 @@ from typing import get_args
 
 import jinja2
 
+from images.builder.errors import UserError
 from tests.latency import gate, limits, trace
 from tests.latency.controls import NO_RT
 from tests.latency.results import Latency, Outcome, Plan, Results
@@ -136,17 +137,16 @@ def render(runs: Sequence[Results]) -> str:
         charts=charts(runs),
         rows=rows(runs),
         verdicts=limits.judge(runs),
-        refusals=refusals(runs),
+        controls=[_judged(run) for run in runs if run.kernel == NO_RT.kernel],
     )
 
 
-def refusals(runs: Sequence[Results]) -> dict[str, str]:
-    """What the gate says of negative controls, by their labels."""
-    return {
-        label(run): gate.refusal(run, gate.accepted(gate.baseline_of_control(run)))
-        for run in runs
-        if run.kernel == NO_RT.kernel
-    }
+def _judged(control: Results) -> str:
+    """What the gate says, refused or not."""
+    try:
+        return gate.check_control(control)
+    except UserError as error:
+        return str(error)
 
 
 def rows(runs: Sequence[Results]) -> list[Row]:

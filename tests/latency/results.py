@@ -162,8 +162,8 @@ def received(data: bytes) -> dict[str, Any]:
     return document
 
 
-def outcome(scenario: Scenario, raw: Mapping[str, Any], samples: int) -> Outcome:
-    """Make sense of a scenario's raw output."""
+def outcome(scenario: Scenario, raw: Mapping[str, Any], samples: int, *, misses: bool = False) -> Outcome:
+    """Make sense of a scenario's raw output. `misses`: periods may have been missed, so there may be fewer samples."""
     if "missing" in raw:
         return Outcome(title=scenario.title, missing=raw["missing"])
     try:
@@ -173,11 +173,11 @@ def outcome(scenario: Scenario, raw: Mapping[str, Any], samples: int) -> Outcome
     latencies = {}
     for name, quantity in scenario.meter.quantities.items():
         thread = found["thread"][name]
-        if thread["cycles"] != samples:
+        if thread["cycles"] != samples and not (misses and 0 < thread["cycles"] < samples):
             raise UserError(f"{scenario.name}: {quantity}: {thread['cycles']} samples instead of {samples}")
         histogram = {int(latency): count for latency, count in thread["histogram"].items()}
         # What is later than the meter's histogram reaches counts as the latest: never better than it was.
-        if beyond := samples - sum(histogram.values()):
+        if beyond := thread["cycles"] - sum(histogram.values()):
             histogram[thread["max"]] = histogram.get(thread["max"], 0) + beyond
         latencies[quantity] = Latency.of(histogram)
     activity = raw["activity"]

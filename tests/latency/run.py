@@ -53,7 +53,8 @@ def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING) -> 
         todo = {"scenarios": described, "commands": control.commands(subject.DIRECTORY)}
         inputs.append(subject.write_initrd(measured, initrd, todo, control.files(board, subject.DIRECTORY)))
         disk = _empty_disk(out / "disk.img") if plan == "disk" else None
-        guest = machine.Machine(emulator, board, measured.kernel, initrd, measured.arguments(without), disk)
+        arguments = measured.arguments(without)
+        guest = machine.Machine(emulator, board, measured.kernel, initrd, arguments, disk, modules=measured.modules)
         commands.append(machine.without_paths(guest.command_line(Path("/c"), Path("/r"))))
         seconds = sum(SECONDS[plan] * scenario.share for scenario in scenarios)
         title = " without ".join([f"latency of {name(board.name, control.kernel or board.kernel, plan)}", *without])
@@ -69,7 +70,7 @@ def measure(board: Board, plan: Plan, out: Path, control: Control = NOTHING) -> 
         qemu=emulator.version("qemu-system-x86"),
         firmware=emulator.version("seabios"),
     )
-    found = results_of(board, plan, binding, documents, planned(plan), VIRTUAL)
+    found = results_of(board, plan, binding, documents, planned(plan), VIRTUAL, misses=bool(control.kernel))
     if control.kernel:
         found = found.model_copy(update={"kernel": control.kernel})
     (out / "results.json").write_text(found.text())
@@ -89,8 +90,10 @@ def results_of(
     documents: list[dict[str, Any]],
     scenarios: list[Scenario],
     where: str,
+    *,
+    misses: bool = False,
 ) -> Results:
-    """Make sense of what the boots of a run sent."""
+    """Make sense of what the boots of a run sent. `misses`: the system may be so late as to miss periods."""
     first = documents[0]
     raw = {name: outcome for document in documents for name, outcome in document["scenarios"].items()}
     return Results(
@@ -103,7 +106,7 @@ def results_of(
         binding=binding,
         boot=results.Boot(**first["boot"]),
         scenarios={
-            scenario.name: results.outcome(scenario, raw[scenario.name], scenario.samples(SECONDS[plan]))
+            scenario.name: results.outcome(scenario, raw[scenario.name], scenario.samples(SECONDS[plan]), misses=misses)
             for scenario in scenarios
         },
     )

@@ -75,6 +75,8 @@ class Subject:
 
     made: BoardBuild
     kernel: Path
+    modules: bool = True
+    """Whether the root's modules are the kernel's."""
 
     @property
     def board(self) -> Board:
@@ -102,7 +104,9 @@ def build(board: Board, other_kernel: str | None = None) -> Subject:
     namespace.check()
     with cache.exclusive():
         made = board_build(board)
-        return Subject(made, kernel.build(other_kernel).image if other_kernel else made.root / "vmlinuz")
+        if other_kernel:
+            return Subject(made, kernel.build(other_kernel).image, modules=False)
+        return Subject(made, made.root / "vmlinuz")
 
 
 def measurement(board: Board, plan: dict[str, Any]) -> dict[str, tuple[int, bytes]]:
@@ -113,9 +117,9 @@ def measurement(board: Board, plan: dict[str, Any]) -> dict[str, tuple[int, byte
     return files
 
 
-def units(board: Board, directory: PurePosixPath) -> dict[str, bytes]:
+def units(board: Board, directory: PurePosixPath, *, modules: bool = True) -> dict[str, bytes]:
     """The measurement's units and the drop-ins that start them, by their names below `systemd/system`."""
-    tty, console = machine.results_tty(board), board.console.tty
+    tty, console = board.ports[machine.results_port(board, modules=modules)].tty, board.console.tty
     files = {}
     for name, (text, target) in UNITS.items():
         files[f"{name}.service"] = text.format(directory=directory, tty=tty, console=console).encode()
@@ -130,9 +134,8 @@ def write_initrd(subject: Subject, out: Path, plan: dict[str, Any], more: Mappin
     """
     absolute = {str(DIRECTORY / name): file for name, file in measurement(subject.board, plan).items()}
     absolute |= {path: (0o644, content) for path, content in more.items()}
-    absolute |= {
-        f"/run/systemd/system/{name}": (0o644, content) for name, content in units(subject.board, DIRECTORY).items()
-    }
+    started = units(subject.board, DIRECTORY, modules=subject.modules)
+    absolute |= {f"/run/systemd/system/{name}": (0o644, content) for name, content in started.items()}
     files = {path.removeprefix("/"): file for path, file in absolute.items()}
     files |= {
         "init": (0o755, (HERE / "init").read_bytes()),
