@@ -214,7 +214,7 @@ def test_a_robot_compiles_what_this_computer_does_to_the_byte(bench: Bench, kind
     assert measured(bench.do(name, "stop"))[1] > 0
     left = bench.guest.shell.run(["sudo", "find", "/data/compilers", "-mindepth", "1"]).stdout.split()
     assert [Path(path).suffix for path in left] == [".squashfs"]
-    assert "/data/compilers" not in bench.guest.shell.run(["losetup", "-l"]).stdout
+    assert "/data/compilers" not in bench.guest.shell.run(["sudo", "losetup", "-l"]).stdout
     bench.do(name, "remove")
 
 

@@ -116,6 +116,7 @@ compile() {
     shift 2
     own_compilers
     room "$need" "compiling"
+    [ -e /dev/loop-control ] || modprobe loop # robots make no device nodes of modules that are not loaded
     mkdir -p "$work/root" "$work/out" "$work/tmp"
     tar -x --no-same-owner -C "$work/out"
     chown -R 65534:65534 "$work/out" "$work/tmp"
