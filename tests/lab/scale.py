@@ -260,7 +260,7 @@ def run(count: int, board: str | None) -> None:
         there = guests()
         samples: list[Sample] = []
         for each in sorted({count >> shift for shift in range(count.bit_length())}):
-            with progress.step(f"fleet.yml on {each} robots"):
+            with progress.step(f"boot {each} light robots and play fleet.yml"):
                 samples.append(measure(each, board, image))
         result = {"board": board} | summary(samples, there)
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
