@@ -150,7 +150,7 @@ def test_robots_that_were_just_flashed_are_up_to_date(guests: Guests) -> None:
 
 def test_a_robots_own_report_stops_the_roll_out(guests: Guests) -> None:
     """The gyro's port is silent, and then the task is stopped now and then, so that it overruns. The same robots are
-    healthy in the test before, where nobody asks for gyro or time. Seen to fail without the condition in fleet.yml."""
+    healthy in the test before, where nobody asks for gyro or time."""
 
     def unhealthy(**wanted: Any) -> str:
         done = guests.play("-e", json.dumps({"health": wanted}))
