@@ -109,7 +109,8 @@ test-kernel: | setup-tests
 # Without make's job server, which ninja cannot use from here.
 test-images: | setup-tests
 	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory check
-	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory fuzz SECONDS=3
+	@# With a seed, so that whoever changed nothing finds nothing.
+	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory fuzz SECONDS=3 SEED=1
 	$(Q)$(FLOTILLA) image --all
 
 test-all: test ## the same, and tests that take minutes for one answer
@@ -136,7 +137,7 @@ check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and un
 	$(Q)$(PYTHON) -m tests.tidy $(BUILD)/runtime-sanitized
 	$(Q)$(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
-fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60]; finds go to build/found
+fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60 SEED=]; finds go to build/found
 	$(Q)images/install-host-packages tests/fuzz-packages.txt
 	$(Q)test -f $(BUILD)/fuzz/build.ninja || CC=clang $(meson) setup $(BUILD)/fuzz runtime -Dtests=true -Dfuzz=true \
 	    -Dbuildtype=debugoptimized >/dev/null
@@ -145,7 +146,7 @@ fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFu
 	$(Q)set -e; for known in runtime/tests/fuzz/corpus/*; do \
 	    name=$${known##*/}; found=$(BUILD)/found/$$name; \
 	    mkdir -p $$found; echo "$$name: $(or $(SECONDS),60) s"; \
-	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(or $(SECONDS),60) -max_len=1024 -timeout=10 -verbosity=0 \
+	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(or $(SECONDS),60) $(if $(SEED),-seed=$(SEED)) -max_len=1024 -timeout=10 -verbosity=0 \
 	        -artifact_prefix=$$found- $$found $$known 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
 bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
