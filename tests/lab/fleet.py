@@ -51,11 +51,12 @@ sudo systemctl list-units --plain --no-legend 'flotilla-task@*'
 def guests_inventory(ports: Mapping[str, int]) -> str:
     """An Ansible inventory that says through which loopback ports the robots' guests are reached.
 
-    A guest's host promises no time, and nothing is plugged into its ports: neither makes it unhealthy.
+    A guest's host promises no time, and nothing is plugged into its ports: neither makes it unhealthy. Ansible would
+    prefer what `group_vars/all.yml` says to a group's variable.
     """
-    hosts = {name: {"ansible_host": "127.0.0.1", "ansible_port": port} for name, port in ports.items()}
     lenient = Health(overruns_percent=100).model_dump()
-    return yaml.safe_dump({"guests": {"hosts": hosts, "vars": {"health": lenient}}})
+    each = {"ansible_host": "127.0.0.1", "health": lenient}
+    return yaml.safe_dump({"guests": {"hosts": {name: {**each, "ansible_port": port} for name, port in ports.items()}}})
 
 
 @contextmanager
