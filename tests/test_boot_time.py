@@ -11,7 +11,7 @@ from tests.latency import boottime
 
 pytestmark = pytest.mark.boot
 
-FIRST_STEP_S = 8.0
+FIRST_STEP_S = 4.0
 """A control task has its first period within this virtual time from the boot loader's end."""
 
 

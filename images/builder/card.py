@@ -54,9 +54,9 @@ DATA = Partition(4, "data", 369 * MIB, 32 * MIB)
 SIZE = DATA.start + DATA.size
 
 COMMON_ARGUMENTS = ["ro", "rootfstype=squashfs", "init=/usr/lib/flotilla/preinit", "net.ifnames=0", "panic=10",
-                    "cpufreq.default_governor=performance", "cryptomgr.notests", "quiet"]  # fmt: skip
+                    "cpufreq.default_governor=performance", "cryptomgr.notests", "noisapnp", "quiet"]  # fmt: skip
 """Kernel command line of every card; the board adds its own. The kernel's self-tests of its ciphers take two seconds of
-each boot under emulation, and more on the board."""
+each boot under emulation, and more on the board; to look for ISA cards without jumpers, a third of one."""
 
 Extents = list[tuple[int, int]]
 """Byte ranges (offset, length) of a card that hold anything."""

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from images.builder import cache, initramfs, kernel, namespace, paths, pool, progress, runtime, tools
+from images.builder import cache, initramfs, kernel, namespace, paths, pool, progress, runtime, tools, vmlinuz
 from images.builder.chroot import Chroot, mount
 from images.builder.fleet import Board
 from images.builder.lock import Lock
@@ -29,7 +29,7 @@ COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-
 """zstd: a Pentium III unpacks it several times faster than xz, at about 8 % more bytes. A boot reads hundreds of small
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
 _SIZE_LIMIT = "3g"
-_STAGE_FILES = ("rootfs.py", "chroot.py", "initramfs.py", "init")
+_STAGE_FILES = ("rootfs.py", "chroot.py", "initramfs.py", "init", "vmlinuz.py")
 
 
 def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
@@ -47,7 +47,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
         tools_lock.digest,
         own.directory.name if own else "",
         drivers.directory.name,
-        board.model_dump_json(include={"disk_modules", "architecture"}),
+        board.model_dump_json(include={"disk_modules", "architecture", "console"}),
         _DATA,
         *sources,
         *_overlay_files(),
@@ -72,6 +72,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
                 "kernels": kernels,
                 "runtime": drivers.package.name,
                 "disk_modules": None if own else board.disk_modules,
+                "console": board.console.tty,
                 "tools": str(toolset),
                 "repository": str(repository),
                 "out": str(out),
@@ -80,6 +81,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             namespace.run_stage(__name__, [str(out / "stage.json")], log)
             shutil.rmtree(repository)
             (out / "stage.json").unlink()
+            (out / "vmlinuz").write_bytes(vmlinuz.without_unpacking((out / "vmlinuz").read_bytes()))
 
     return cache.result("rootfs", key, make)
 
@@ -146,7 +148,7 @@ def main(description_file: str) -> None:
     with _timed("overlay"):
         _remove_excluded(stage.target)
         _lay_overlay(stage.target)
-        _configure(stage)
+        _configure(stage, description["console"])
     with _timed("clean"):
         contents = _clean(stage)
     out = Path(description["out"])
@@ -241,7 +243,9 @@ def _prune_modules(stage: Stage, version: str) -> None:
         for module in fnmatch.filter(needs, f"kernel/{pattern}.ko"):
             kept |= {module, *needs[module].split()}
     for path in (directory / "kernel").rglob("*.ko"):
-        if str(path.relative_to(directory)) not in kept:
+        if str(path.relative_to(directory)) in kept:
+            path.write_bytes(vmlinuz.without_signature(path.read_bytes()))
+        else:
             path.unlink()
     stage.in_tools("depmod", "-b", "/target", version)
 
@@ -258,14 +262,16 @@ def _lay_overlay(target: Path) -> None:
             place.chmod(0o755 if os.access(source, os.X_OK) else 0o644)
 
 
-def _configure(stage: Stage) -> None:
-    """Accounts, services and mount points: what the overlay's files cannot say by themselves."""
+def _configure(stage: Stage, console: str) -> None:
+    """Accounts, services, the console's log-in and mount points: what the overlay's files cannot say by themselves."""
     stage.in_target("groupadd", "--system", "realtime")
     stage.in_target(
         "useradd", "--uid", "1000", "--user-group", "--no-create-home", "--home-dir", "/home/robot",
         "--shell", "/bin/bash", "--groups", "dialout,video,realtime", "robot",
     )  # fmt: skip
     stage.in_target("systemctl", "preset-all", "--preset-mode=full")
+    stage.in_target("systemctl", "set-default", "multi-user.target")
+    stage.in_target("systemctl", "enable", f"serial-getty@{console}.service")
     (stage.target / "data").mkdir()
 
 
