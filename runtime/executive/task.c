@@ -3,6 +3,8 @@
 
 #include "block.h"
 
+#include <limits.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -55,14 +57,23 @@ static void make_block(struct building *building, struct registry *registry, con
         problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
 }
 
-static const char *device_of(const struct fl_block *block, const struct fl_parameter *parameter)
+static const void *value_of(const struct fl_block *block, const struct fl_parameter *parameter)
 {
-    if (parameter->kind != FL_KIND_DEVICE)
-        return NULL;
-    return ((const struct fl_device *)((const char *)block->parameters + parameter->offset))->path;
+    return (const char *)block->parameters + parameter->offset;
 }
 
-/* Two blocks on one device would take each other's bytes. */
+static bool same_device(const struct fl_block *a, const struct fl_parameter *of_a, const struct fl_block *b,
+                        const struct fl_parameter *of_b)
+{
+    if (of_a->kind == FL_KIND_DEVICE && of_b->kind == FL_KIND_DEVICE) {
+        const struct fl_device *one = value_of(a, of_a), *other = value_of(b, of_b);
+        return one->path && other->path && strcmp(one->path, other->path) == 0;
+    }
+    return of_a == of_b && of_a->flags & FL_EXCLUSIVE &&
+           *(const int *)value_of(a, of_a) == *(const int *)value_of(b, of_b);
+}
+
+/* Two blocks on one device would take each other's bytes, or undo each other's commands. */
 static void check_devices(struct building *building)
 {
     const struct task *task = building->task;
@@ -71,12 +82,16 @@ static void check_devices(struct building *building)
             const struct fl_block *later = task->members[i].block, *earlier = task->members[j].block;
             for (uint32_t p = 0; p < later->type->parameter_count; p++) {
                 for (uint32_t q = 0; q < earlier->type->parameter_count; q++) {
-                    const char *path = device_of(later, &later->type->parameters[p]);
-                    const char *other = device_of(earlier, &earlier->type->parameters[q]);
-                    if (path && other && strcmp(path, other) == 0)
-                        problem(building->problems, building->file->blocks[i].line,
-                                "block %s: %s is block %s's; a device serves one block", later->name, path,
-                                earlier->name);
+                    const struct fl_parameter *parameter = &later->type->parameters[p];
+                    if (!same_device(later, parameter, earlier, &earlier->type->parameters[q]))
+                        continue;
+                    char text[PATH_MAX] = "";
+                    FILE *out = fmemopen(text, sizeof text, "w");
+                    parameter_write(parameter, later->parameters, out);
+                    fclose(out);
+                    problem(building->problems, building->file->blocks[i].line,
+                            "block %s: %s %s is block %s's; a device serves one block", later->name, parameter->name,
+                            text, earlier->name);
                 }
             }
         }

@@ -94,6 +94,8 @@ enum {
     /* may be set while the task runs, between two steps: `step` reads it where it uses it. Not for texts and lists, and
      * not for what start, initialize or a driver's thread reads. */
     FL_TUNABLE = 1u << 0,
+    /* the choice names a device, such as a board by its address: of this type of block one only may have it */
+    FL_EXCLUSIVE = 1u << 1,
 };
 
 struct fl_parameter {
