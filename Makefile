@@ -180,8 +180,9 @@ latency: | setup-tests ## latency in virtual time within its limits, a control r
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
 	$(Q)$(FLOTILLA) hwcheck --robot $(call need,ROBOT) $(if $(SECONDS),--seconds $(SECONDS))
 
-latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and make that the accepted latency [BOARD=]
+latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
 	$(Q)$(LATENCY) accept $(measured)
+	$(Q)$(PYTHON) -m tests.virtual_loop
 
 boot-time: | setup-tests ## where a boot spends its time, in virtual time
 	$(Q)$(LATENCY) boot-time $(measured)

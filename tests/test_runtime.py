@@ -166,7 +166,7 @@ REFUSED = {
     ),
     "a device twice": (
         task("a: {type: trace, parameters: {device: /dev/x}}\nb: {type: trace, parameters: {device: /dev/x}}"),
-        "4: block b: device \"/dev/x\" is block a's; a device serves one block",
+        '4: block b: device "/dev/x" is block a\'s; a device serves one block',
     ),
     "a board twice": (
         task("a: {type: ir104-pbf}\nb: {type: ir104-pbf, parameters: {base: 0x300}}"),

@@ -1,8 +1,4 @@
-"""Control loops inside one guest in virtual time: every figure repeats to the byte, so it may be judged.
-
-The board's shipped system with our kernel, booted from memory as for latency measurements. Tasks and the plug-in with
-the loop's other end enter from outside.
-"""
+"""Control loops inside one guest in virtual time are judged, and have the very latency that was accepted."""
 
 from __future__ import annotations
 
@@ -13,125 +9,21 @@ from typing import Any
 
 import pytest
 
-from images.builder import paths, runtime
+from images.builder.errors import UserError
 from images.builder.fleet import Board, Fleet
-from tests.latency import machine, results, subject
-from tests.latency.subject import DIRECTORY
+from tests import virtual_loop
+from tests.latency.results import Latency
+from tests.virtual_loop import SECONDS, TARGET_RAD_S, run
 
 pytestmark = pytest.mark.boot
 
-PLUGIN = paths.PROJECT / "runtime" / "tests" / "plugin" / "loopback.c"
-SECONDS = 5
 SETTLED = 300
 """Steps after which the velocity loop, whose drive first has to be configured, has to hold."""
-
-CHAIN = """
-period: 10 ms
-priority: 80
-blocks:
-  frames: {{type: frames, parameters: {{device: {device}}}}}
-  gyro: {{type: dsp3000, parameters: {{device: {device}}}}}
-  attitude: {{type: pid, in: {{set_point: 0, measurement: gyro.rate}}, parameters: {{kp: 1000, min: -1, max: 1}}}}
-  valve: {{type: schmitt-trigger, in: {{in: attitude.out}}, parameters: {{on: 0.01, off: 0}}}}
-  relays: {{type: ir104-pbf, in: {{command: valve.on, flag: gyro.flag}}, parameters: {{channels: [1]}}}}
-  chain: {{type: chain, in: {{rate: gyro.rate, after: relays.mismatch}}, parameters: {{file: /run/latencies.json}}}}
-"""
-
-FAST = """
-period: 10 ms
-priority: 80
-blocks:
-  wave: {type: trajectory, parameters: {waypoints: [0, 1], times: [0, 10]}}
-  out: {type: queue-send, in: {data: wave.position}, parameters: {name: /wave}}
-"""
-
-SLOW = """
-period: 100 ms
-phase: 5 ms
-priority: 70
-blocks:
-  in: {type: queue-receive, parameters: {name: /wave}}
-  filtered: {type: low-pass, in: {in: in.data}, parameters: {time_constant: 1}}
-"""
-
-# The robot's controller sets the motor's current. Two CAN boards are on one bus: the robot's own, and the drive's, for
-# which an emulator runs in the guest, because the host may have no CAN.
-CAN_BOARDS = ("-object", "can-bus,id=bus", *("-device", "kvaser_pci,canbus=bus") * 2)
-EMULATOR = ("tests/emulators/can_bus.py", "tests/emulators/epos2.py")
-TARGET_RAD_S = 5.0
-VELOCITY = f"""
-period: 10 ms
-priority: 60
-blocks:
-  drive:
-    type: epos2
-    in: {{target: limit.out, enable: 1}}
-    parameters: {{interface: can0, node: 3, mode: current, counts: 2000, gear: 10, heartbeat: 0.5, timeout: 0.5}}
-  before: {{type: delay, in: {{in: drive.velocity}}}}
-  controller:
-    type: pid
-    in: {{set_point: {TARGET_RAD_S}, measurement: before.out}}
-    parameters: {{kp: 0.05, ki: 0.2, min: -1, max: 1}}
-  limit: {{type: limit, in: {{in: controller.out}}, parameters: {{min: -1, max: 1}}}}
-"""
-WATCH = ("--watch", "drive.velocity,drive.enabled,drive.flag,drive.abort")
-# The drive's state after the task is the last line.
-DRIVE = """
-import subprocess, sys
-from tests.emulators.can_bus import SocketCanBus
-from tests.emulators.epos2 import Epos2, Epos2Server
-for interface in ("can0", "can1"):
-    subprocess.run(["ip", "link", "set", interface, "up", "type", "can", "bitrate", "1000000"], check=True)
-drive = Epos2(3)
-with Epos2Server(SocketCanBus("can1"), drive).running():
-    status = subprocess.run(sys.argv[1:]).returncode
-    print(drive.axis.name)
-sys.exit(status)
-"""
-
-RUN = "flotilla-run --blocks {directory} --steps {steps} --statistics /run/{name}.json {directory}/{name}.yml"
 
 
 @pytest.fixture(scope="module")
 def board(fleet: Fleet) -> Board:
-    return fleet.boards["smartcoret3"].model_copy(update={"kernel": "lean"})
-
-
-def run(board: Board, out: Path) -> dict[str, str]:
-    """What the commands in the guest said, as text."""
-    device = f"/dev/{board.ports[subject.tested_ports(board)['uart_own']].tty}"
-    chain = RUN.format(name="chain", steps=SECONDS * 100, directory=DIRECTORY)
-    fast = RUN.format(name="fast", steps=SECONDS * 100, directory=DIRECTORY)
-    slow = RUN.format(name="slow", steps=SECONDS * 10, directory=DIRECTORY)
-    velocity = RUN.format(name="velocity", steps=SECONDS * 100, directory=DIRECTORY).split()
-    commands = {  # which run in the order of their names
-        "chain": ["sh", "-c", f"{chain} && cat /run/latencies.json"],
-        "drive": ["python3", f"{DIRECTORY}/drive.py", *velocity, *WATCH],
-        "both": ["sh", "-c", f"{{ {fast}; echo fast: $?; }} 2>&1 & {{ {slow}; echo slow: $?; }} 2>&1; wait"],
-        "fast": ["cat", "/run/fast.json"],
-        "slow": ["cat", "/run/slow.json"],
-    }
-    files = {
-        "chain.yml": CHAIN.format(device=device).encode(),
-        "fast.yml": FAST.encode(),
-        "slow.yml": SLOW.encode(),
-        "velocity.yml": VELOCITY.encode(),
-        "drive.py": DRIVE.encode(),
-        "loopback.so": runtime.compile_plugin(PLUGIN, board.architecture),
-    }
-    files |= {name: (paths.PROJECT / name).read_bytes() for name in EMULATOR}
-    measured = subject.build(board)
-    out.mkdir(parents=True, exist_ok=True)
-    initrd = out / "initrd.img"
-    subject.write_initrd(
-        measured, initrd, {"scenarios": [], "commands": commands},
-        {str(DIRECTORY / name): content for name, content in files.items()},
-    )  # fmt: skip
-    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=CAN_BOARDS)
-    document = results.received(guest.run(out, 600))
-    initrd.unlink()
-    said: dict[str, str] = document["commands"]
-    return said
+    return virtual_loop.board_of(fleet)
 
 
 @pytest.fixture(scope="module")
@@ -145,13 +37,27 @@ def read(text: str) -> dict[str, Any]:
 
 
 def test_a_frame_becomes_a_valve_within_two_periods(said: dict[str, str]) -> None:
-    """From the first byte's write to the port, through line, driver, controller and relay board's I/O port."""
-    chain = read(said["chain"])
-    histogram = {int(us): count for us, count in chain["histogram_us"].items()}
-    assert chain["late"] == 0
+    histogram = virtual_loop.chain(said).histogram_us
+    assert read(said["chain"])["late"] == 0
     assert sum(histogram.values()) >= SECONDS * 100 - 60, "frames are lost"
     print(f"frame to valve: {min(histogram)} to {max(histogram)} µs")
     assert max(histogram) < 20_000
+
+
+def test_a_frame_becomes_a_valve_as_late_as_was_accepted(said: dict[str, str]) -> None:
+    virtual_loop.check(virtual_loop.chain(said))
+
+
+def test_another_latency_is_refused_with_what_moved(said: dict[str, str], tmp_path: Path) -> None:
+    found = virtual_loop.chain(said)
+    file = tmp_path / "accepted.json"
+    with pytest.raises(UserError, match=r"is missing.*make latency-accept"):
+        virtual_loop.check(found, file)
+    file.write_text(json.dumps(found.histogram_us))
+    virtual_loop.check(found, file)
+    later = Latency.of({us + 7: count for us, count in found.histogram_us.items()})
+    with pytest.raises(UserError, match=rf"min {min(found.histogram_us)} → {min(later.histogram_us)}.*accept"):
+        virtual_loop.check(later, file)
 
 
 def test_two_rates_on_one_computer_keep_their_time(said: dict[str, str]) -> None:
