@@ -133,19 +133,23 @@ def run(board: Board, out: Path) -> dict[str, str]:
 
 def chain(said: dict[str, str]) -> Latency:
     """From the first byte's write to the port, through line, driver, controller and relay board's I/O port."""
-    return Latency.of({int(us): count for us, count in json.loads(said["chain"])["histogram_us"].items()})
+    return _latency(json.loads(said["chain"])["histogram_us"])
 
 
 def check(found: Latency, file: Path = BASELINE) -> None:
     """UserError with what moved."""
     if not file.exists():
         raise UserError(f"{paths.shown(file)} is missing: nothing to compare with; make it: {gate.ACCEPT}")
-    accepted = Latency.of({int(us): count for us, count in json.loads(file.read_text()).items()})
+    accepted = _latency(json.loads(file.read_text()))
     if found != accepted:
         raise UserError(
             f"frame to valve: {gate.differences(accepted, found)}; accepted is {paths.shown(file)}; if this is meant: "
             f"{gate.ACCEPT}, commit it"
         )
+
+
+def _latency(counts: dict[str, int]) -> Latency:
+    return Latency.of({int(us): count for us, count in counts.items()})
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from images.builder import cache, initramfs, kernel, namespace, paths, pool, progress, runtime, tools, vmlinuz
+from images.builder import cache, debian_kernel, initramfs, kernel, namespace, paths, pool, progress, runtime, tools
 from images.builder.chroot import Chroot, mount
 from images.builder.fleet import Board
 from images.builder.lock import Lock
@@ -29,7 +29,7 @@ COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-
 """zstd: a Pentium III unpacks it several times faster than xz, at about 8 % more bytes. A boot reads hundreds of small
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
 _SIZE_LIMIT = "3g"
-_STAGE_FILES = ("rootfs.py", "chroot.py", "initramfs.py", "init", "vmlinuz.py")
+_STAGE_FILES = ("rootfs.py", "chroot.py", "debian_kernel.py", "initramfs.py", "init")
 
 
 def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
@@ -47,6 +47,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
         tools_lock.digest,
         own.directory.name if own else "",
         drivers.directory.name,
+        debian_kernel.PACKER,
         board.model_dump_json(include={"disk_modules", "architecture", "console"}),
         _DATA,
         *sources,
@@ -81,7 +82,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             namespace.run_stage(__name__, [str(out / "stage.json")], log)
             shutil.rmtree(repository)
             (out / "stage.json").unlink()
-            (out / "vmlinuz").write_bytes(vmlinuz.without_unpacking((out / "vmlinuz").read_bytes()))
+            (out / "vmlinuz").write_bytes(debian_kernel.repacked((out / "vmlinuz").read_bytes()))
 
     return cache.result("rootfs", key, make)
 
@@ -244,7 +245,7 @@ def _prune_modules(stage: Stage, version: str) -> None:
             kept |= {module, *needs[module].split()}
     for path in (directory / "kernel").rglob("*.ko"):
         if str(path.relative_to(directory)) in kept:
-            path.write_bytes(vmlinuz.without_signature(path.read_bytes()))
+            path.write_bytes(debian_kernel.without_signature(path.read_bytes()))
         else:
             path.unlink()
     stage.in_tools("depmod", "-b", "/target", version)

@@ -8,7 +8,7 @@ import struct
 import lz4.block
 import pytest
 
-from images.builder import vmlinuz
+from images.builder import debian_kernel
 from images.builder.errors import UserError
 
 SETUP_SECTS = 3
@@ -38,7 +38,7 @@ def bzimage(payload: bytes) -> bytes:
 
 def test_the_kernel_is_packed_as_it_lies_in_memory() -> None:
     """Seen to fail with the second segment at its place in the file instead of in memory."""
-    kernel = vmlinuz.without_unpacking(bzimage(lzma.compress(elf()) + struct.pack("<I", len(elf()))))
+    kernel = debian_kernel.repacked(bzimage(lzma.compress(elf()) + struct.pack("<I", len(elf()))))
     setup, protected = kernel[: (SETUP_SECTS + 1) * 512], kernel[(SETUP_SECTS + 1) * 512 :]
     stub, packed = protected[:STUB], protected[STUB:]
     (end,) = struct.unpack_from("<I", stub, stub.index(b"\x81\xfe") + 2)  # cmp esi, end
@@ -56,12 +56,12 @@ def test_the_kernel_is_packed_as_it_lies_in_memory() -> None:
 def test_another_kind_of_kernel_stays_what_it_is(payload: bytes) -> None:
     """Our own kernel is packed with LZ4; one of 64 bits expects more of who starts it."""
     kernel = bzimage(payload)
-    assert vmlinuz.without_unpacking(kernel) == kernel
+    assert debian_kernel.repacked(kernel) == kernel
 
 
 def test_what_is_no_kernel_is_refused() -> None:
     with pytest.raises(UserError, match="not a bzImage"):
-        vmlinuz.without_unpacking(bytes(4096))
+        debian_kernel.repacked(bytes(4096))
 
 
 def test_a_module_loses_its_signature_and_nothing_else() -> None:
@@ -69,5 +69,5 @@ def test_a_module_loses_its_signature_and_nothing_else() -> None:
     signature = bytes(range(200))
     described = struct.pack(">8xI", len(signature))
     signed = module + signature + described + b"~Module signature appended~\n"
-    assert vmlinuz.without_signature(signed) == module
-    assert vmlinuz.without_signature(module) == module
+    assert debian_kernel.without_signature(signed) == module
+    assert debian_kernel.without_signature(module) == module
