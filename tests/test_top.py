@@ -39,7 +39,8 @@ def test_one_table_where_there_is_no_terminal(tmp_path: Path) -> None:
 
 
 def test_keys_on_a_terminal(tmp_path: Path) -> None:
-    """A question, its answer, a key that is none, and Ctrl-C, by the keys of a terminal."""
+    """A question, its answer, a key that is none, and Ctrl-C: keys are heard as soon as the screen names them. Seen to
+    fail with a keyboard that listens 1.5 s after the screen is up."""
     fleet = on_loopback(tmp_path / "inventory")
     terminal, theirs = pty.openpty()
     argv = [sys.executable, "-m", "runtime.station", "--top", "--inventory", str(fleet), "--address", ADDRESS]

@@ -54,8 +54,9 @@ def run(arguments: argparse.Namespace) -> None:
             receiver.sinks.append(top)
             if not doing and not top.console.is_terminal:
                 seconds = seconds or TOP_S
-            during.enter_context(top.screen())
+            # The keyboard first: what is typed before it listens is lost, and the screen says which keys there are.
             keys = during.enter_context(keyboard(top.press)) if top.console.is_terminal else {}
+            during.enter_context(top.screen())
             note = None
         else:
             note = during.enter_context(progress.step(" and ".join(doing))).note
