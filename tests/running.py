@@ -1,4 +1,4 @@
-"""A task that runs on this computer, by the runtime's real executive, and what it prints."""
+"""A task that runs on this computer or on a robot, by the runtime's real executive, and what it prints."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import json
 import os
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from tests.lab.ssh import Ssh
 
 PATIENCE = 60
 """Seconds, for what takes well under one: the machine may be busy."""
@@ -19,9 +22,23 @@ Row = dict[str, Any]
 """What the watched signals are after a step; where all are of one block, by the names of its ports."""
 
 
+def watching(signals: str) -> list[str]:
+    """Options of flotilla-run."""
+    return ["--watch", signals] if signals else []
+
+
 class Task:
+    """On this computer."""
+
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.process = process
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def wait(self) -> int:
+        """Until it has ended; its status."""
+        return self.process.wait(PATIENCE)
 
     def rows(self) -> Iterator[Row]:
         """Row after row; it fails when they last for longer than one may wait, or the task ends."""
@@ -42,8 +59,8 @@ class Task:
     def end(self) -> int:
         """Ask it to end; its status."""
         if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
-            self.process.send_signal(signal.SIGCONT)
+            self.signal(signal.SIGTERM)
+            self.signal(signal.SIGCONT)
             self.process.communicate(timeout=PATIENCE)
         return self.process.returncode
 
@@ -64,3 +81,51 @@ def running(
                 Task(process).end()
             finally:
                 process.kill()
+
+
+# Keeps what it is told on its input: names of signals; its end asks the task to end. The task is alone on the output.
+_THERE = """
+printf '%s' "$1" >"$2"
+shift 2
+exec 3<&0
+"$@" & task=$!
+{
+    while read -r name; do kill -"$name" $task; done
+    kill -TERM $task; kill -CONT $task
+} <&3 >/dev/null 2>&1 & reader=$!
+wait $task
+status=$?
+kill $reader 2>/dev/null
+exit $status
+"""
+
+_AS_ROOT = ("sudo", "--preserve-env=CYCLONEDDS_URI")  # which a robot's services have, too
+
+
+class TaskThere(Task):
+    """On a robot, as root."""
+
+    def signal(self, number: signal.Signals) -> None:
+        assert self.process.stdin
+        self.process.stdin.write(f"{number.name.removeprefix('SIG')}\n")
+        self.process.stdin.flush()
+
+    def end(self) -> int:
+        self.process.communicate(timeout=PATIENCE)  # its input ends
+        return self.process.returncode
+
+
+@contextmanager
+def running_there(shell: Ssh, name: str, text: str, *options: str) -> Iterator[Task]:
+    """The same on a robot, by its own flotilla-run."""
+    path = f"/tmp/{name}.yml"
+    argv = [*_AS_ROOT, "sh", "-c", _THERE, "sh", text, path, "flotilla-run", *options, path]
+    with shell.start(argv) as process:
+        limit = threading.Timer(2 * PATIENCE, process.kill)  # a guest that is gone says nothing
+        limit.start()
+        try:
+            yield (task := TaskThere(process))
+            task.end()
+        finally:
+            limit.cancel()
+            process.kill()

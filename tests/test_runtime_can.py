@@ -29,6 +29,13 @@ blocks:
     in: {{target: {target}, enable: 1}}
     parameters: {{node: 3, mode: {mode}, counts: 2000, gear: 10, heartbeat: 0.2{more}}}
 """
+FRAMES = """
+period: 5 ms
+priority: 0
+blocks:
+  out: {type: can-send, in: {data: 7}, parameters: {id: 0x123, length: 1}}
+  back: {type: can-receive, parameters: {id: 0x123}}
+"""
 
 WATCHED = "drive.position,drive.velocity,drive.current,drive.enabled,drive.flag,drive.error,drive.abort,drive.sequence"
 
@@ -50,7 +57,7 @@ def hub() -> Iterator[UdpHub]:
 
 
 @pytest.fixture
-def start(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path) -> Callable[..., Any]:
+def run(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path) -> Callable[..., Any]:
     environment = {"LD_PRELOAD": str(udp_can), "CAN_HUB": str(hub.port)}
     return lambda text, watched=WATCHED: running(
         [flotilla_run, "--watch", watched], tmp_path / "task.yml", text, environment
@@ -71,9 +78,9 @@ def drive_task(mode: str, target: float, more: str = "") -> str:
         ("current", 0.2, "current"),
     ],
 )
-def test_every_mode_reaches_its_target(start: Any, hub: UdpHub, mode: str, target: float, output: str) -> None:
+def test_every_mode_reaches_its_target(run: Any, hub: UdpHub, mode: str, target: float, output: str) -> None:
     drive = Epos2(NODE)
-    with Epos2Server(hub, drive).running(), start(drive_task(mode, target)) as task:
+    with Epos2Server(hub, drive).running(), run(drive_task(mode, target)) as task:
         row = task.until(lambda row: abs(row[output] - target) < 0.05 * abs(target))
         assert row["enabled"] == 1
         assert row["flag"] == 1
@@ -82,11 +89,11 @@ def test_every_mode_reaches_its_target(start: Any, hub: UdpHub, mode: str, targe
     assert drive.axis is Axis.SWITCH_ON_DISABLED
 
 
-def test_a_refused_object_keeps_the_motor_off(start: Any, hub: UdpHub) -> None:
+def test_a_refused_object_keeps_the_motor_off(run: Any, hub: UdpHub) -> None:
     drive = Epos2(NODE)
     drive.wrong.refuse[0x1603, 2] = 0x06040041
     server = Epos2Server(hub, drive)
-    with server.running(), start(drive_task("velocity", 1)) as task:
+    with server.running(), run(drive_task("velocity", 1)) as task:
         assert task.until(lambda row: row["abort"])["abort"] == 0x06040041
         with server.paused():
             assert drive.axis is Axis.SWITCH_ON_DISABLED
@@ -94,10 +101,10 @@ def test_a_refused_object_keeps_the_motor_off(start: Any, hub: UdpHub) -> None:
         assert task.until(lambda row: row["enabled"])["abort"] == 0
 
 
-def test_a_fault_is_told_and_stays(start: Any, hub: UdpHub) -> None:
+def test_a_fault_is_told_and_stays(run: Any, hub: UdpHub) -> None:
     drive = Epos2(NODE)
     server = Epos2Server(hub, drive)
-    with server.running(), start(drive_task("velocity", 5)) as task:
+    with server.running(), run(drive_task("velocity", 5)) as task:
         task.until(lambda row: row["enabled"])
         with server.paused():
             drive.fault(0x2310)
@@ -110,10 +117,10 @@ def test_a_fault_is_told_and_stays(start: Any, hub: UdpHub) -> None:
             assert drive.axis is Axis.FAULT
 
 
-def test_automatic_reset_clears_a_fault(start: Any, hub: UdpHub) -> None:
+def test_automatic_reset_clears_a_fault(run: Any, hub: UdpHub) -> None:
     drive = Epos2(NODE)
     server = Epos2Server(hub, drive)
-    with server.running(), start(drive_task("velocity", 5, "fault_reset: automatic")) as task:
+    with server.running(), run(drive_task("velocity", 5, "fault_reset: automatic")) as task:
         task.until(lambda row: row["enabled"])
         with server.paused():
             drive.fault(0x8611)
@@ -121,10 +128,10 @@ def test_automatic_reset_clears_a_fault(start: Any, hub: UdpHub) -> None:
         assert task.until(lambda row: row["enabled"])["error"] == 0
 
 
-def test_a_drive_that_lost_its_power_comes_back(start: Any, hub: UdpHub) -> None:
+def test_a_drive_that_lost_its_power_comes_back(run: Any, hub: UdpHub) -> None:
     drive = Epos2(NODE)
     server = Epos2Server(hub, drive)
-    with server.running(), start(drive_task("velocity", 5)) as task:
+    with server.running(), run(drive_task("velocity", 5)) as task:
         task.until(lambda row: row["enabled"])
         with server.paused():
             drive.power_off()
@@ -134,13 +141,13 @@ def test_a_drive_that_lost_its_power_comes_back(start: Any, hub: UdpHub) -> None
         task.until(lambda row: row["enabled"] and row["velocity"] > 4.5)
 
 
-def test_a_stopped_task_stops_the_motor(start: Any, hub: UdpHub) -> None:
+def test_a_stopped_task_stops_the_motor(run: Any, hub: UdpHub) -> None:
     """SIGSTOP: nothing of the task runs any more, so the drive misses its heartbeats."""
     drive = Epos2(NODE)
     server = Epos2Server(hub, drive)
-    with server.running(), start(drive_task("velocity", 5)) as task:
+    with server.running(), run(drive_task("velocity", 5)) as task:
         task.until(lambda row: row["velocity"] > 4.5)
-        task.process.send_signal(signal.SIGSTOP)
+        task.signal(signal.SIGSTOP)
         deadline = time.monotonic() + PATIENCE
         while True:
             with server.paused():
@@ -152,20 +159,20 @@ def test_a_stopped_task_stops_the_motor(start: Any, hub: UdpHub) -> None:
         assert abs(drive.motor.rpm) < 5
 
 
-def test_survives_a_bad_bus(start: Any, hub: UdpHub) -> None:
+def test_survives_a_bad_bus(run: Any, hub: UdpHub) -> None:
     """Frames lost, and frames of random content under the drive's own identifiers."""
     drive = Epos2(NODE, seed=4)
     drive.wrong.loss = 0.02
     drive.wrong.nonsense = 0.02
-    with Epos2Server(hub, drive).running(), start(drive_task("velocity", 5, "fault_reset: automatic")) as task:
+    with Epos2Server(hub, drive).running(), run(drive_task("velocity", 5, "fault_reset: automatic")) as task:
         task.until(lambda row: row["enabled"] and abs(row["velocity"] - 5) < 0.5)
         task.until(lambda row: row["sequence"] > 500)
 
 
-def test_a_silent_drive_makes_the_flag_0(start: Any, hub: UdpHub) -> None:
+def test_a_silent_drive_makes_the_flag_0(run: Any, hub: UdpHub) -> None:
     drive = Epos2(NODE)
     server = Epos2Server(hub, drive)
-    with server.running(), start(drive_task("velocity", 5)) as task:
+    with server.running(), run(drive_task("velocity", 5)) as task:
         task.until(lambda row: row["flag"])
         with server.paused():
             drive.wrong.silent = True
@@ -175,17 +182,10 @@ def test_a_silent_drive_makes_the_flag_0(start: Any, hub: UdpHub) -> None:
         task.until(lambda row: row["flag"])
 
 
-def test_frames_pass_between_two_blocks(start: Any, hub: UdpHub) -> None:
-    text = """
-period: 5 ms
-priority: 0
-blocks:
-  out: {type: can-send, in: {data: 7}, parameters: {id: 0x123, length: 1}}
-  back: {type: can-receive, parameters: {id: 0x123}}
-"""
+def test_frames_pass_between_two_blocks(run: Any, hub: UdpHub) -> None:
     with (
         Epos2Server(hub).running(),  # without a drive: the hub passes frames on while it is read
-        start(text, "out.sent,out.flag,back.data,back.length,back.flag,back.sequence") as task,
+        run(FRAMES, "out.sent,out.flag,back.data,back.length,back.flag,back.sequence") as task,
     ):
         row = task.until(lambda row: row["back.sequence"] > 5)
         assert row["back.data"] == [7, 0, 0, 0, 0, 0, 0, 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -69,5 +70,5 @@ def test_a_topic_between_two_tasks(start: Start) -> None:
                 assert row["wrench"] == [0.25, -0.5, 0.125]
                 heard = row["sequence"]
                 hearing.until(lambda row, heard=heard: row["sequence"] > heard + 20)
-                telling.process.kill()
+                telling.signal(signal.SIGKILL)
                 hearing.until(lambda row: row["flag"] == 0)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.emulators.igps import Faults, Igps
-from tests.running import PATIENCE, Task, running
+from tests.running import PATIENCE, Task, running, watching
 
 pytestmark = pytest.mark.alone
 
@@ -23,7 +23,11 @@ Start = Callable[..., AbstractContextManager[Task]]
 
 @pytest.fixture
 def start(flotilla_run: Path, tmp_path: Path) -> Start:
-    return lambda name, text, *options: running([flotilla_run, *options], tmp_path / f"{name}.yml", text)
+    def start(name: str, text: str, watched: str = "", *options: str) -> AbstractContextManager[Task]:
+        command: list[str | Path] = [flotilla_run, *watching(watched), *options]
+        return running(command, tmp_path / f"{name}.yml", text)
+
+    return start
 
 
 @pytest.fixture
@@ -70,7 +74,7 @@ def path_of(seconds: float) -> tuple[float, float]:
 def test_position_is_the_robots(start: Start) -> None:
     port = free_port()
     with (
-        start("igps", IGPS.format(port=port), "--watch", IGPS_SIGNALS) as task,
+        start("igps", IGPS.format(port=port), IGPS_SIGNALS) as task,
         Igps(("127.0.0.1", port), path_of, rate=64) as igps,
     ):
         seen = []
@@ -90,7 +94,7 @@ def test_position_is_the_robots(start: Start) -> None:
 def test_silence_is_flagged_and_ends(start: Start) -> None:
     port = free_port()
     with (
-        start("igps", IGPS.format(port=port), "--watch", IGPS_SIGNALS) as task,
+        start("igps", IGPS.format(port=port), IGPS_SIGNALS) as task,
         Igps(("127.0.0.1", port), path_of, rate=100) as igps,
     ):
         task.until(lambda row: row["flag"] == 1)
@@ -110,7 +114,7 @@ def test_nothing_bad_is_taken_for_a_position(start: Start) -> None:
     port = free_port()
     bad = Faults(loss=0.1, garbage=0.3, blind=0.2, wild=0.2, burst=3)
     with (
-        start("igps", IGPS.format(port=port), "--watch", IGPS_SIGNALS) as task,
+        start("igps", IGPS.format(port=port), IGPS_SIGNALS) as task,
         Igps(("127.0.0.1", port), path_of, rate=512, faults=bad),
     ):
         for row in task.rows():
@@ -142,7 +146,7 @@ priority: 0
 blocks:
   udp:
     type: udp-receive
-    parameters: {{port: {port}, length: {length}, timeout: 0.2}}
+    parameters: {{port: {port}, length: {length}, timeout: 0.5}}
 """
 
 RECEIVED = "udp.data,udp.flag,udp.sequence,udp.dropped,udp.refused"
@@ -151,16 +155,16 @@ RECEIVED = "udp.data,udp.flag,udp.sequence,udp.dropped,udp.refused"
 def test_udp_from_task_to_task(start: Start) -> None:
     port = free_port()
     with (
-        start("receiver", RECEIVER.format(port=port, length=4), "--watch", RECEIVED) as receiver,
+        start("receiver", RECEIVER.format(port=port, length=4), RECEIVED) as receiver,
         start("sender", SENDER.format(port=port)) as sender,
     ):
         row = receiver.until(lambda row: row["sequence"] >= 10)
         assert row["data"] == [70, 108, 111, 255]
         assert row["flag"] == 1
         assert row["refused"] == 0
-        sender.process.send_signal(signal.SIGSTOP)
+        sender.signal(signal.SIGSTOP)
         assert receiver.until(lambda row: row["flag"] == 0)["data"] == [70, 108, 111, 255]
-        sender.process.send_signal(signal.SIGCONT)
+        sender.signal(signal.SIGCONT)
         receiver.until(lambda row: row["flag"] == 1)
         assert sender.end() == 0
         receiver.until(lambda row: row["flag"] == 0)
@@ -169,7 +173,7 @@ def test_udp_from_task_to_task(start: Start) -> None:
 def test_udp_of_another_length_is_refused(start: Start) -> None:
     port = free_port()
     with (
-        start("receiver", RECEIVER.format(port=port, length=5), "--watch", RECEIVED) as receiver,
+        start("receiver", RECEIVER.format(port=port, length=5), RECEIVED) as receiver,
         start("sender", SENDER.format(port=port)),
     ):
         row = receiver.until(lambda row: row["refused"] >= 5)
@@ -190,7 +194,7 @@ def test_a_datagram_triggers_a_step_and_silence_does(start: Start, tmp_path: Pat
     Seen to fail with `trigger` left out of the task, and with an `await` that returns for a datagram that is refused.
     """
     port, statistics = free_port(), tmp_path / "statistics.json"
-    options = ("--watch", RECEIVED, "--statistics", str(statistics))
+    options = (RECEIVED, "--statistics", str(statistics))
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
         start("triggered", TRIGGERED.format(port=port), *options) as task,
@@ -215,7 +219,7 @@ def test_a_datagram_triggers_a_step_and_silence_does(start: Start, tmp_path: Pat
 
 def test_a_port_is_for_one(start: Start, refusal: Callable[..., tuple[int, str]]) -> None:
     port = free_port()
-    with start("receiver", RECEIVER.format(port=port, length=4), "--watch", RECEIVED) as receiver:
+    with start("receiver", RECEIVER.format(port=port, length=4), RECEIVED) as receiver:
         receiver.until(lambda row: True)
         status, said = refusal(RECEIVER.format(port=port, length=4))
     assert status == 1
@@ -255,12 +259,12 @@ def queue(tmp_path: Path) -> Iterator[str]:
 
 
 def test_queue_between_two_rates(start: Start, queue: str) -> None:
-    with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
+    with start("receiver", QUEUE_RECEIVER.format(name=queue), QUEUED) as receiver:
         assert receiver.until(lambda row: True)["flag"] == 0
-        with start("sender", QUEUE_SENDER.format(name=queue), "--steps", "50") as sender:
+        with start("sender", QUEUE_SENDER.format(name=queue), "", "--steps", "50") as sender:
             row = receiver.until(lambda row: row["flag"] == 1)
             assert row["data"] == [2.5, -1]
-            assert sender.process.wait(PATIENCE) == 0
+            assert sender.wait() == 0
         row = receiver.until(lambda row: row["flag"] == 0)
         assert row["age"] > 0.3
         assert row["sequence"] + row["dropped"] == 50  # none unaccounted for
@@ -270,20 +274,20 @@ def test_queue_between_two_rates(start: Start, queue: str) -> None:
 def test_queue_outlives_a_killed_task(start: Start, queue: str) -> None:
     with start("sender", QUEUE_SENDER.format(name=queue)) as sender:
         for _ in range(2):
-            with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
+            with start("receiver", QUEUE_RECEIVER.format(name=queue), QUEUED) as receiver:
                 receiver.until(lambda row: row["flag"] == 1)
-                receiver.process.kill()
-                receiver.process.wait()
-        with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
-            sender.process.kill()
-            sender.process.wait()
+                receiver.signal(signal.SIGKILL)
+                receiver.wait()
+        with start("receiver", QUEUE_RECEIVER.format(name=queue), QUEUED) as receiver:
+            sender.signal(signal.SIGKILL)
+            sender.wait()
             receiver.until(lambda row: row["flag"] == 0)
             with start("sender", QUEUE_SENDER.format(name=queue)):
                 receiver.until(lambda row: row["flag"] == 1)
 
 
 def test_queue_of_another_width_is_explained(start: Start, refusal: Callable[..., tuple[int, str]], queue: str) -> None:
-    with start("receiver", QUEUE_RECEIVER.format(name=queue), "--watch", QUEUED) as receiver:
+    with start("receiver", QUEUE_RECEIVER.format(name=queue), QUEUED) as receiver:
         receiver.until(lambda row: True)
         status, said = refusal(
             QUEUE_SENDER.format(name=queue).replace("width: 2", "width: 1").replace("[2.5, -1]", "1")

@@ -34,6 +34,68 @@ def watching(
     return running([binary, "--watch", watched], directory / "task.yml", text)
 
 
+# Devices and what their blocks make of them; tests/test_blocks_guest.py has them, too.
+
+
+def gyro(format: Format) -> Dsp3000:
+    return Dsp3000(lambda seconds: 90.0, format)
+
+
+GYRO = {"positive": "counterclockwise"}
+WORDS = {"baud": 115200, "format": "words"}
+
+
+def check_gyro(row: Row) -> None:
+    assert row["rate"] == pytest.approx(-math.pi / 2, abs=0.01)
+
+
+def magnetometer() -> MicroMag3:
+    return MicroMag3(noise=0)
+
+
+MAGNETOMETER = {"pollfreq": 16}
+
+
+def check_magnetometer(row: Row) -> None:
+    assert row["heading"] == pytest.approx(math.radians(194.74))
+    assert row["field"] == [-106, -403, 98]
+
+
+BATTERY_OUTPUTS = ("charge", "present", "charging", "voltage", "current", "temperature", "charges")
+
+
+def batteries() -> OceanServer:
+    return OceanServer({1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}, charging=4)
+
+
+def check_batteries(row: Row) -> None:
+    assert row["charge"] == pytest.approx(0.6)
+    assert (row["present"], row["charging"]) == (5, 4)
+    assert row["voltage"][:3] == pytest.approx([16.661, 0, 15.5])
+    assert row["current"][:3] == pytest.approx([-0.02, 0, 1.25])
+    assert row["temperature"][:3] == pytest.approx([296.4, 0, 296.4])
+    assert row["charges"][:3] == pytest.approx([0.5, 0, 0.7])
+
+
+def good_batteries(row: Row) -> bool:
+    """The last record of each measurement is there, too."""
+    return good(row) and row["charges"][2] > 0
+
+
+def scanner() -> Urg:
+    return Urg(lambda step, seconds: 7 if step == 50 else 1000 + step, old=True, noise=0)
+
+
+SCAN = {"first_step": 44, "last_step": 143}
+
+
+def check_scan(row: Row) -> None:
+    assert len(row["ranges"]) == 100
+    assert row["ranges"][6] is None  # an error code: not a number
+    expected = [(1000 + step) / 1000 for step in range(44, 144)]
+    assert row["ranges"][7:] == pytest.approx(expected[7:])
+
+
 def good(row: Row) -> bool:
     return bool(row["flag"])
 
@@ -42,24 +104,25 @@ def bad(row: Row) -> bool:
     return not row["flag"]
 
 
-@pytest.mark.parametrize(("format", "baud"), [("text", 38400), ("words", 115200)])
-def test_gyro_through_faults_and_unplugging(flotilla_run: Path, tmp_path: Path, format: Format, baud: int) -> None:
-    gyro = Dsp3000(lambda seconds: 90.0, format)
+@pytest.mark.parametrize(("format", "more"), [("text", {}), ("words", WORDS)], ids=["text", "words"])
+def test_gyro_through_faults_and_unplugging(
+    flotilla_run: Path, tmp_path: Path, format: Format, more: dict[str, Any]
+) -> None:
+    device = gyro(format)
     # The timeout is long, so that a busy machine is not taken for a fault; the flag must fall by what is wrong.
-    parameters = {"baud": baud, "format": format, "timeout": 5, "positive": "counterclockwise"}
-    with SerialLine(gyro) as line, watching(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run:
+    parameters = {**GYRO, **more, "timeout": 5}
+    with SerialLine(device) as line, watching(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run:
         row = run.until(good)
-        assert row["rate"] == pytest.approx(-math.pi / 2, abs=0.01)
+        check_gyro(row)
         assert run.until(lambda later: later["sequence"] > row["sequence"] + 50)["age"] < 5
 
-        gyro.valid = False
-        held = run.until(bad)["rate"]
-        assert held == pytest.approx(-math.pi / 2, abs=0.01)
-        gyro.valid = True
+        device.valid = False
+        check_gyro(run.until(bad))
+        device.valid = True
         run.until(good)
-        gyro.rate = lambda seconds: 380.0  # beyond full scale
+        device.rate = lambda seconds: 380.0  # beyond full scale
         run.until(bad)
-        gyro.rate = lambda seconds: 10.0
+        device.rate = lambda seconds: 10.0
         assert run.until(good)["rate"] == pytest.approx(math.radians(-10), abs=0.01)
 
         line.unplug()
@@ -86,7 +149,7 @@ def test_gyro_through_faults_and_unplugging(flotilla_run: Path, tmp_path: Path, 
 def test_gyros_words_survive_faults(flotilla_run: Path, tmp_path: Path, faults: Faults, wrong: float) -> None:
     """A third of the words is spoilt, and what comes is what was measured."""
     gyro = Dsp3000(lambda seconds: 90.0, "words", noise=0)
-    parameters = {"baud": 115200, "format": "words", "timeout": 5}
+    parameters = {**WORDS, "timeout": 5}
     with (
         SerialLine(gyro, faults=faults, seed=7) as line,
         watching(flotilla_run, tmp_path, line, "dsp3000", "rate", **parameters) as run,
@@ -128,14 +191,13 @@ def test_wrong_baud_is_never_good(flotilla_run: Path, tmp_path: Path) -> None:
 
 
 def test_magnetometer(flotilla_run: Path, tmp_path: Path) -> None:
-    compass = MicroMag3(noise=0)
+    compass = magnetometer()
+    parameters = {**MAGNETOMETER, "timeout": 3}
     with (
         SerialLine(compass) as line,
-        watching(flotilla_run, tmp_path, line, "micromag3", "heading", "field", "error", pollfreq=16, timeout=3) as run,
+        watching(flotilla_run, tmp_path, line, "micromag3", "heading", "field", "error", **parameters) as run,
     ):
-        row = run.until(good)
-        assert row["heading"] == pytest.approx(math.radians(194.74))
-        assert row["field"] == [-106, -403, 98]
+        check_magnetometer(run.until(good))
         assert compass.pollfreq == 16
         compass.error = 0x200
         assert run.until(bad)["error"] == 0x200
@@ -162,21 +224,11 @@ def test_magnetometer_with_unknown_checksums(flotilla_run: Path, tmp_path: Path)
 
 
 def test_batteries(flotilla_run: Path, tmp_path: Path) -> None:
-    controller = OceanServer({1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}, charging=4)
     with (
-        SerialLine(controller) as line,
-        watching(
-            flotilla_run, tmp_path, line, "oceanserver", "charge", "present", "charging", "voltage", "current",
-            "temperature", "charges", timeout=4,
-        ) as run,
-    ):  # fmt: skip
-        row = run.until(lambda row: row["flag"] and row["charges"][2])
-        assert row["charge"] == pytest.approx(0.6)
-        assert (row["present"], row["charging"]) == (5, 4)
-        assert row["voltage"][:3] == pytest.approx([16.661, 0, 15.5])
-        assert row["current"][:3] == pytest.approx([-0.02, 0, 1.25])
-        assert row["temperature"][:3] == pytest.approx([296.4, 0, 296.4])
-        assert row["charges"][:3] == pytest.approx([0.5, 0, 0.7])
+        SerialLine(batteries()) as line,
+        watching(flotilla_run, tmp_path, line, "oceanserver", *BATTERY_OUTPUTS, timeout=4) as run,
+    ):
+        check_batteries(run.until(good_batteries))
         line.unplug()
         run.until(bad)
         line.replug()
@@ -187,15 +239,12 @@ def test_batteries(flotilla_run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", ["stream", "poll"])
 def test_laser_scanner(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
-    scanner = Urg(lambda step, seconds: 7 if step == 50 else 1000 + step, old=True, noise=0)
-    parameters = {"first_step": 44, "last_step": 143, "mode": mode, "timeout": 5}
-    with SerialLine(scanner) as line:
+    device = scanner()
+    parameters = {**SCAN, "mode": mode, "timeout": 5}
+    with SerialLine(device) as line:
         with watching(flotilla_run, tmp_path, line, "urg", "ranges", "timestamp", **parameters) as run:
             row = run.until(good)
-            assert len(row["ranges"]) == 100
-            assert row["ranges"][6] is None  # an error code: not a number
-            expected = [(1000 + step) / 1000 for step in range(44, 144)]
-            assert row["ranges"][7:] == pytest.approx(expected[7:])
+            check_scan(row)
             run.until(lambda later: later["timestamp"] > row["timestamp"])
             line.faults = Faults(corrupt=1)
             assert run.until(bad)["age"] > 5
@@ -205,8 +254,8 @@ def test_laser_scanner(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
             run.until(bad)
             line.replug()
             run.until(good)
-            assert scanner.laser
+            assert device.laser
         end = time.monotonic() + PATIENCE
-        while scanner.laser:  # the task has ended, and said so
+        while device.laser:  # the task has ended, and said so
             assert time.monotonic() < end
             time.sleep(0.01)

@@ -65,6 +65,12 @@ class Ssh:
             )
         return result
 
+    def start(self, argv: Sequence[str]) -> subprocess.Popen[str]:
+        """A command that goes on, with pipes to its input and from its output."""
+        if self._master is None or self._master.poll() is not None:
+            self.connect()
+        return subprocess.Popen(self._command(argv), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
     def read(self, path: str) -> bytes:
         done = self._run(["cat", "--", path], 60, b"")
         if done.returncode:
@@ -84,12 +90,16 @@ class Ssh:
         deadline = Deadline(timeout)
         if self._master is None or self._master.poll() is not None:
             self.connect(min(CONNECT_SECONDS, timeout))
-        command = ["ssh", *self._options, self._host, shlex.join(argv)]
         try:
-            return subprocess.run(command, input=stdin, capture_output=True, timeout=deadline.left, check=False)
+            return subprocess.run(
+                self._command(argv), input=stdin, capture_output=True, timeout=deadline.left, check=False
+            )
         except subprocess.TimeoutExpired as error:
             so_far = _text(error.stdout or b"") + _text(error.stderr or b"")
             raise Expired(f"{self._robot.name}: {shlex.join(argv)}: no end within {timeout:g} s\n{so_far}") from None
+
+    def _command(self, argv: Sequence[str]) -> list[str]:
+        return ["ssh", *self._options, self._host, shlex.join(argv)]
 
     def _try_to_connect(self, deadline: Deadline) -> str | None:
         """Start the shared connection: None when it stands, else what ssh said."""
