@@ -71,9 +71,23 @@ static void set_listener(dds_listener_t *listener)
     dds_lset_publication_matched(listener, matched);
 }
 
+/* A best-effort writer keeps no sample, and so no instance: DDS would make the robot's anew for each sample, and its
+ * garbage collector, at the same priority, take it away again. What is registered stays until the participant goes. */
+static void keep_instance(struct state *state, dds_entity_t writer)
+{
+    const struct dds_publish *set = state->block->parameters;
+    dds_instance_handle_t handle;
+    state->taken.robot = (uint16_t)set->robot;
+    dds_encode(&state->settings, &state->taken, state->storage);
+    dds_return_t registered = dds_register_instance(writer, &handle, state->storage);
+    if (registered != DDS_RETCODE_OK)
+        fl_log(state->block, "topic %s: instance: %s", state->settings.topic, dds_strretcode(registered));
+}
+
 static void serve(void *context, struct fl_driver *driver, dds_entity_t writer)
 {
     struct state *state = context;
+    keep_instance(state, writer);
     while (fl_driver_wait(driver, state->wake[1], false, -1) == 1)
         write_newest(state, writer);
 }
