@@ -43,12 +43,12 @@ def _fly(names: list[str], side_m: float) -> None:
 
 
 def _fly_guests(names: list[str], side_m: float) -> None:
-    """By UDP: that guests fly by DDS has not been shown yet."""
-    if names not in ([], ["udp"]):
-        raise UserError(f"{' '.join(names)}: guests fly udp, the others are for virtual time")
+    there = {plan.name: plan for plan in plans(side_m) if plan.name in guests.FLIGHTS}
+    if others := [name for name in names if name not in there]:
+        raise UserError(f"{', '.join(others)}: guests fly {', '.join(there)}; all else is for virtual time")
     shutil.rmtree(GUESTS, ignore_errors=True)
-    (plan,) = (plan for plan in plans(side_m) if plan.name == "udp")
-    flown = {plan.title: guests.fly(plan, GUESTS)}
+    chosen = [there[name] for name in names or there]
+    flown = {plan.title: guests.fly(plan, GUESTS / plan.name) for plan in chosen}
     page = report.write(flown, paths.BUILD / "reports", "flights", guests.HOW)
     print(f"{paths.shown(page)}; consoles of the guests: {paths.shown(GUESTS)}")
 

@@ -38,6 +38,8 @@ HOW = (
     "Each is a guest of its card image, all on one Ethernet segment, in real time on this computer, whose speed the "
     "latencies show. The robot's own clock measures them."
 )
+FLIGHTS = ("udp", "dds")
+"""Undisturbed, by each transport: the names of the plans that guests fly."""
 PERIOD_NS = 10_000_000
 IGPS_PORT = 5010
 LOOPBACK = "127.0.0.1"
@@ -141,9 +143,27 @@ class Laboratory:
         deadline = Deadline(seconds)
         while not what():
             if deadline.expired:
-                raise Expired(f"not within {seconds:g} s: {'; '.join(self._receiver.summary)}")
+                commands = self._records.get("valves", [])
+                good = sum(record["good"] for record in commands)
+                said = "; ".join([f"{good} of {len(commands)} commands good", *self._receiver.summary])
+                raise Expired(f"not within {seconds:g} s: {said}. A busy computer is too slow for guests in real time")
             select.select(self._sockets, [], [], min(deadline.left, 0.1))
             self._hear()
+
+    def wait_connected(self) -> None:
+        """Until commands of a second's steps have come all the way round: DDS has to find its peers first."""
+        self._forget()
+        steps = round(1e9 / PERIOD_NS)
+        self.until(
+            lambda: len({record["number"] for record in self._records.get("valves", ())[-2 * steps :]}) >= steps,
+            BOOT_SECONDS,
+        )
+
+    def _forget(self) -> None:
+        """What was said so far."""
+        while select.select(self._sockets, [], [], 0)[0]:
+            self._hear()
+        self._records = {}
 
     def _hear(self) -> None:
         for one in self._sockets:
@@ -156,9 +176,7 @@ class Laboratory:
 
     def begin(self, velocity: Motion = AT_REST) -> None:
         """A flight, from where the robot is. Before the first one it gets no positions, so control waits."""
-        while select.select(self._sockets, [], [], 0)[0]:  # what was said before is not of this flight
-            self._hear()
-        self._records = {}
+        self._forget()
         self.robot.release(velocity)
         self._igps.faults = Faults()
 
@@ -237,6 +255,7 @@ def laboratory(plan: Plan, out: Path) -> Iterator[Laboratory]:
             for shell in shells.values():
                 shell.connect(BOOT_SECONDS)
             lab.restart_with(plan)
+            lab.wait_connected()
         yield lab
 
 
