@@ -116,10 +116,13 @@ class TaskThere(Task):
 
 
 @contextmanager
-def running_there(shell: Ssh, name: str, text: str, *options: str) -> Iterator[Task]:
+def running_there(
+    shell: Ssh, name: str, text: str, *options: str, environment: Mapping[str, str] | None = None
+) -> Iterator[Task]:
     """The same on a robot, by its own flotilla-run."""
     path = f"/tmp/{name}.yml"
-    argv = [*_AS_ROOT, "sh", "-c", _THERE, "sh", text, path, "flotilla-run", *options, path]
+    command = ["env", *(f"{key}={value}" for key, value in (environment or {}).items()), "flotilla-run", *options]
+    argv = [*_AS_ROOT, "sh", "-c", _THERE, "sh", text, path, *command, path]
     with shell.start(argv) as process:
         limit = threading.Timer(2 * PATIENCE, process.kill)  # a guest that is gone says nothing
         limit.start()
