@@ -149,7 +149,7 @@ def sensors_task(station: object) -> tuple[str, str]:
         name: {"type": one.type, "parameters": dict(one.parameters)} for name, one in SENSORS.items()
     }
     watched = {name: one.outputs for name, one in SENSORS.items()}
-    positioning = {"port": IGPS_PORT, "from": str(station), "range": 50, "timeout": 1}
+    positioning = {"port": IGPS_PORT, "from": str(station), "range": 10_000, "timeout": 1}
     blocks["igps"] = {"type": "igps", "parameters": positioning}
     watched["igps"] = ("position",)
     for name, camera in CAMERAS.items():
