@@ -17,8 +17,13 @@ from images.builder.chroot import Chroot
 
 _ARCHITECTURES = {"i386": "i386", "amd64": "x86_64"}
 """Debian's names and the kernel's."""
-_UNUSED = ["Documentation/*/*", "drivers/gpu/drm/*.[ch]", "tools/testing/*", "sound/*.[ch]", "samples/*.[ch]"]
-"""Not unpacked: half of the source's bytes, of which such a kernel needs only the Kconfig files."""
+_UNUSED = [
+    "Documentation/*/*", "arch/[!x]*.[chS]", "arch/[!x]*.dts*", "drivers/gpu/drm/*.[ch]", "samples/*.[ch]",
+    "sound/*.[ch]", "tools/perf/*", "tools/testing/*",
+]  # fmt: skip
+"""Not unpacked: more than half of the source's bytes, of which such a kernel needs only the Kconfig files."""
+_FASTER = "-pipe -ftrack-macro-expansion=0"
+"""Of the compiler, with the same objects as result: a twentieth of the time, most of which goes into headers."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,8 @@ class Stage:
         # kbuild with the locked programs, whatever their usual names would be.
         self.make = [
             "make", "-C", "/out/source", "O=/out/objects", f"ARCH={_ARCHITECTURES[description.architecture]}",
-            "CC=gcc-12", "HOSTCC=gcc-12", "YACC=bison", "--no-print-directory",
+            "CC=gcc-12", "HOSTCC=gcc-12", "YACC=bison", f"KCFLAGS={_FASTER}", "--no-print-directory",
+            f"-j{os.cpu_count()}",
         ]  # fmt: skip
         self.chroot.provide_system(out=self.out)
 
@@ -64,7 +70,9 @@ class Stage:
         (self.out / "source").mkdir()
         (self.out / "objects").mkdir()
         unused = [f"--exclude={self.description.source}/{pattern}" for pattern in _UNUSED]
-        self.chroot.run("tar", "-xf", archive, "-C", "/out/source", "--strip-components=1", "--wildcards", *unused)
+        self.chroot.run(
+            "tar", "-I", "xz -T0", "-xf", archive, "-C", "/out/source", "--strip-components=1", "--wildcards", *unused
+        )
         self.chroot.run(*self.make, "-s", "allnoconfig")
         shutil.copy(self.out / "objects/.config", self.out / "config")
         files = sorted(path for path in (self.out / "source").rglob("Kconfig*") if path.is_file())
@@ -73,7 +81,7 @@ class Stage:
     def build(self) -> None:
         """Compile, and leave the Debian package and `kernel.json`."""
         targets = ["bzImage", "modules"] if self.description.modules else ["bzImage"]
-        self.chroot.log(*self.make, f"-j{os.cpu_count()}", *targets)
+        self.chroot.log(*self.make, *targets)
         release = self.chroot.run(*self.make, "-s", "kernelrelease").strip()
         package = self.out / "package"
         package.mkdir()
@@ -89,9 +97,9 @@ class Stage:
         self._control(package, release)
         self._settle(package)
         name = f"linux-image-{release}_{self._version()}_{self.description.architecture}.deb"
-        self.chroot.run(
-            "dpkg-deb", "--root-owner-group", "-Zxz", "--threads-max=1", "--build", "/out/package", f"/out/{name}"
-        )
+        # Nearly all in it is packed already: more effort takes four seconds more for a twentieth of the size.
+        pack = ["dpkg-deb", "--root-owner-group", "-Zxz", "-z1", "--threads-max=1"]
+        self.chroot.run(*pack, "--build", "/out/package", f"/out/{name}")
         (self.out / "kernel.json").write_text(json.dumps({"release": release}) + "\n")
         for directory in ("source", "objects", "package"):
             shutil.rmtree(self.out / directory)
