@@ -193,6 +193,16 @@ def test_kernel_is_real_time(robot: RobotGuest) -> None:
     assert "PREEMPT_RT" in version, f"the kernel is {version}"
 
 
+def test_scheduler_keeps_no_task_that_sleeps(robot: RobotGuest) -> None:
+    """It would take them out later, all at once with interrupts off. Seen to fail without preinit's: DELAY_DEQUEUE."""
+    assert sh(robot, "findmnt /sys/kernel/debug", check=False) == "", "it stays mounted"
+    shown = sh(
+        robot,
+        "mount -t debugfs debug /sys/kernel/debug; cat /sys/kernel/debug/sched/features; umount /sys/kernel/debug",
+    )
+    assert "NO_DELAY_DEQUEUE" in shown.split()
+
+
 def test_slot_is_marked_good(robot: RobotGuest) -> None:
     assert _boot_variables(robot) == {"ORDER": "A B", "A_OK": "1", "A_TRY": "0", "B_OK": "0", "B_TRY": "0"}
     assert "/boot" not in sh(robot, "cut -d ' ' -f 2 /proc/mounts").split(), "/boot stays mounted"
@@ -640,15 +650,16 @@ def test_dds_configuration_reaches_everyone(robot: RobotGuest) -> None:
 
 @pytest.fixture(scope="module")
 def dds(pentium: RobotGuest, fleet: Fleet) -> dict[str, Any]:
-    """What DDS does with the configuration as shipped, and with others: `changed`, `alone` and `greedy`."""
+    """What DDS does with the configuration as shipped, and with others."""
     shipped = pentium.shell.read("/etc/flotilla/cyclonedds.xml").decode()
+    any_port = (r"(?s)<Peers>.*?</Peers>", f'<Peers><Peer Address="{pentium.robot.address}"/></Peers>')
     changed = _edited(
         shipped,
         (r"<AllowMulticast>.*?<", "<AllowMulticast>true<"),
         (r"<MaxMessageSize>.*?<", "<MaxMessageSize>3000B<"),
         (r"<FragmentSize>.*?<", "<FragmentSize>500B<"),
         (r"<MaxAutoParticipantIndex>.*?<", "<MaxAutoParticipantIndex>3<"),
-        (r"(?s)<Peers>.*?</Peers>", f'<Peers><Peer Address="{pentium.robot.address}"/></Peers>'),
+        any_port,
         (r"<MultipleReceiveThreads>.*?<", "<MultipleReceiveThreads>true<"),
         (r"(?s)<Threads>.*?</Threads>", ""),
     )
@@ -658,7 +669,13 @@ def dds(pentium: RobotGuest, fleet: Fleet) -> dict[str, Any]:
         (r"<ParticipantIndex>.*?<", "<ParticipantIndex>none<"),
     )
     greedy = _edited(shipped, (r'<SocketReceiveBufferSize min=".*?"', '<SocketReceiveBufferSize min="8MB"'))
-    runs = {"shipped": (shipped, 2), "changed": (changed, 2), "alone": (alone, 1), "greedy": (greedy, 1)}
+    runs = {
+        "shipped": (shipped, 2),
+        "any-port": (_edited(shipped, any_port), 1),
+        "changed": (changed, 2),
+        "alone": (alone, 1),
+        "greedy": (greedy, 1),
+    }
     domain = fleet.network.dds_domain
     return {name: call(pentium, observe_dds, text, domain, count, 3) for name, (text, count) in runs.items()}
 
@@ -670,12 +687,23 @@ def _edited(text: str, *changes: tuple[str, str]) -> str:
     return text
 
 
-def _dds_case(option: str, read: Callable[[dict[str, Any]], object], expected: object, other: str = "changed") -> Any:
-    return pytest.param(read, expected, other, id=option)
+def _dds_case(
+    option: str,
+    read: Callable[[dict[str, Any]], object],
+    expected: object,
+    other: str = "changed",
+    shipped: str = "shipped",
+) -> Any:
+    return pytest.param(read, expected, shipped, other, id=option)
+
+
+def _asked(run: dict[str, Any]) -> list[tuple[str, int]]:
+    """Where an announcement went: addresses, and ports of participants, not of their data."""
+    return [(peer, port) for peer, port in run["sent"] if port >= 10 and port % 2 == 0]
 
 
 @pytest.mark.parametrize(
-    ("read", "expected", "other"),
+    ("read", "expected", "shipped", "other"),
     [
         _dds_case("NetworkInterface", lambda run: run["advertised"], ["own"], "alone"),
         _dds_case("AllowMulticast", lambda run: "239.255.0.1" in run["groups"], False),
@@ -683,8 +711,8 @@ def _dds_case(option: str, read: Callable[[dict[str, Any]], object], expected: o
         _dds_case("MaxMessageSize", lambda run: 1000 < run["largest"] <= 1400, True),
         _dds_case("FragmentSize", lambda run: run["fragments"], [1300]),
         _dds_case("ParticipantIndex", lambda run: {0, 1, 2, 3} <= set(run["bound"]), True, "alone"),
-        _dds_case("MaxAutoParticipantIndex", lambda run: len({p for a, p in run["sent"] if p >= 10 and p % 2 == 0}), 5),
-        _dds_case("Peers", lambda run: sorted({peer for peer, _ in run["sent"]}), "everyone"),
+        _dds_case("MaxAutoParticipantIndex", lambda run: len(_asked(run)), 10, shipped="any-port"),
+        _dds_case("Peers", lambda run: [peer for peer in _asked(run) if peer[0] not in run["advertised"]], "everyone"),
         _dds_case("MultipleReceiveThreads", lambda run: sorted(set(run["threads"]) & {"recvMC", "recvUC"}), []),
         _dds_case("Scheduling", lambda run: run["real_time"], {"recv": 60}),
         _dds_case("StackSize", lambda run: run["stacks"] >= 5, True),
@@ -697,14 +725,20 @@ def test_dds_obeys(
     fleet: Fleet,
     read: Callable[[dict[str, Any]], object],
     expected: object,
+    shipped: str,
     other: str,
 ) -> None:
     """Each option of cyclonedds.xml has the effect it is there for, and another value has another."""
     if expected == ["own"]:
         expected = [str(pentium.robot.address)]
     if expected == "everyone":
-        expected = sorted(str(host.address) for host in identity.hosts(fleet))
-    assert read(dds["shipped"]) == expected, f"as shipped: {dds['shipped']}"
+        others = [robot for robot in fleet.robots.values() if robot.number != pentium.robot.number]
+        expected = sorted(
+            (str(robot.address), 10 + 2 * program)
+            for robot in others
+            for program in range(len(robot.control_tasks) + 1)
+        )
+    assert read(dds[shipped]) == expected, f"as shipped: {dds[shipped]}"
     assert read(dds[other]) != expected, f"with another value, the same: {dds[other]}"
 
 

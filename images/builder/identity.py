@@ -88,6 +88,21 @@ def hosts(fleet: Fleet) -> list[Host]:
     return sorted([*fleet.robots.values(), *fleet.stations], key=lambda host: host.address)
 
 
+def _first_dds_port(fleet: Fleet) -> int:
+    """The first of the 250 that a domain has (DDSI-RTPS 2.1, 9.6.1)."""
+    return 7400 + 250 * fleet.network.dds_domain
+
+
+def dds_peers(fleet: Fleet) -> list[str]:
+    """Where DDS looks for others: `address:port` of each robot's control tasks, and of one program more of each robot.
+
+    Programs of a computer take the first port that is free, whichever they are.
+    """
+    robots = sorted(fleet.robots.values(), key=lambda robot: robot.address)
+    discovery = _first_dds_port(fleet) + 10
+    return [f"{robot.address}:{discovery + 2 * n}" for robot in robots for n in range(len(robot.control_tasks) + 1)]
+
+
 def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
     """What control tasks may use."""
     return {"fleet": fleet, "network": fleet.network, "robot": robot, "board": fleet.boards[robot.board]}
@@ -96,12 +111,12 @@ def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
 def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
     """What the templates may use."""
     keys = host_keys(fleet)
-    first = 7400 + 250 * fleet.network.dds_domain
+    first = _first_dds_port(fleet)
     return _description(fleet, robot) | {
         "hosts": hosts(fleet),
         "interface": fleet.interface(robot),
-        # DDSI-RTPS 2.1, 9.6.1: ports of a domain, up to the participant index that discovery asks for.
         "dds_ports": f"{first}-{first + 249}",
+        "dds_peers": dds_peers(fleet),
         "host_keys": keys,
         "host_public_key": keys[robot.name],
         "host_private_key": (paths.KEYS / f"{robot.name}_ed25519").read_text(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import stat
 from pathlib import Path, PurePosixPath
@@ -114,6 +115,8 @@ def test_a_robot_that_stands_by_is_sent_to_and_listened_to() -> None:
     for transport in ("udp", "dds"):
         assert rendered(transport, "control", both)["to_mapping"]["in"]["withhold"] == "silent.out"
         assert "withhold" not in rendered(transport, "control", {})["to_mapping"]["in"]
+        assert rendered(transport, "control", {})["to_mapping"]["in"]["sequence"] == "state.sequence"
+        assert "sequence" not in rendered(transport, "sensors", {})["to_navigation"]["in"]
     with pytest.raises(UserError, match=r"navigation: no robot can stand by for it, and robot4 does"):
         rendered("udp", "control", {"robot4": "navigation"})
 
@@ -128,6 +131,16 @@ def test_stations_hear_all_and_the_first_says_where_the_robot_is() -> None:
     both = ["170.160.1.254", "170.160.1.252"]
     assert sensors["igps"]["parameters"]["from"] == valves["to_station"]["parameters"]["address"] == both
     assert {stream.port for stream in telemetry.streams(flying)} == {5020, 5021}
+
+
+def test_dds_looks_for_each_robots_tasks_and_one_program_more() -> None:
+    described = virtual.fleet("dds")
+    there = re.findall('<Peer Address="(.*?)"', _text(described, described.robots[1], "/etc/flotilla/cyclonedds.xml"))
+    of = {str(robot.address): len(robot.control_tasks) for robot in described.robots.values()}
+    first = 7400 + 250 * described.network.dds_domain + 10
+    assert there == [f"{address}:{first + 2 * n}" for address, tasks in of.items() for n in range(tasks + 1)]
+    assert there == identity.dds_peers(described)
+    assert len(there) == 5 + 4
 
 
 def test_every_port_in_use_gets_its_name_and_baud_rate(fleet: Fleet) -> None:
