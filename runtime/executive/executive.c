@@ -126,20 +126,22 @@ static void sleep_until(int64_t release_ns)
 
 /* Wait until a step is due; when it was. `expected_ns`: when it should be, which what triggers it moves.
  *
- * A trigger may come half a period early or late. Nothing for longer is a step without it, so that there are as many
- * steps as periods and blocks notice the silence; something sooner waits, so that a flood cannot be a flood of steps.
+ * A trigger may come half a period early or three quarters late. Nothing for longer is a step without it, so that there
+ * are as many steps as periods and blocks notice the silence; something sooner waits, so that a flood cannot be a flood
+ * of steps. What comes later than that makes two steps of this task, and two messages of which the next one may take
+ * only the newer; a whole period's patience could not tell one that is late from the next.
  */
 static int64_t wait_for_release(struct executive *executive, int64_t *expected_ns)
 {
     struct fl_block *trigger = executive->task->trigger;
-    const int64_t half_ns = executive->task->period_ns / 2;
+    const int64_t early_ns = executive->task->period_ns / 2, late_ns = executive->task->period_ns * 3 / 4;
     if (executive->options->no_wait)
         return *expected_ns;
     if (!trigger) {
         sleep_until(*expected_ns);
         return *expected_ns;
     }
-    const int64_t earliest_ns = *expected_ns - half_ns, latest_ns = *expected_ns + half_ns;
+    const int64_t earliest_ns = *expected_ns - early_ns, latest_ns = *expected_ns + late_ns;
     sleep_until(earliest_ns);
     int64_t came_ns = trigger->type->await(trigger, latest_ns);
     if (!came_ns) {

@@ -24,6 +24,7 @@ struct state {
     void *storage;
     int wake[2]; /* a byte for each sample: the step's end, and the thread's */
     uint32_t number;
+    uint32_t sequence; /* in the step before; 0: nothing has come yet, or nothing is wired */
     _Atomic uint32_t peers, written;
 };
 
@@ -32,9 +33,14 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct dds_publish, robot, .min = 0, .max = 65535, .summary = "number of the robot that sends"),
 };
 
-enum { WITHHOLD, DATA };
+enum { WITHHOLD, SEQUENCE, DATA };
 static const struct fl_port inputs[] = {
     {.name = "withhold", .type = FL_BOOLEAN, .width = 1, .flags = FL_OPTIONAL, .summary = "1: nothing is published"},
+    {.name = "sequence",
+     .type = FL_UINT32,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "of what the data are made of: nothing is published in a step to which it brought nothing new"},
 };
 
 enum { PEERS, WRITTEN };
@@ -124,7 +130,9 @@ static int step(struct fl_block *block)
 {
     const struct dds_publish *set = block->parameters;
     struct state *state = block->state;
-    if (!FL_IN(block, WITHHOLD, uint8_t)) {
+    uint32_t before = state->sequence;
+    state->sequence = FL_IN(block, SEQUENCE, uint32_t);
+    if (!FL_IN(block, WITHHOLD, uint8_t) && !(before && before == state->sequence)) {
         struct dds_sample sample = {.robot = (uint16_t)set->robot, .number = state->number++};
         struct timespec real;
         clock_gettime(CLOCK_REALTIME, &real);

@@ -29,6 +29,11 @@ static const struct fl_parameter parameters[] = {
 
 static const struct fl_port inputs[] = {
     {.name = "withhold", .type = FL_BOOLEAN, .width = 1, .flags = FL_OPTIONAL, .summary = "1: nothing is sent"},
+    {.name = "sequence",
+     .type = FL_UINT32,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "of what the data are made of: nothing is sent in a step to which it brought nothing new"},
 };
 
 static const struct fl_port outputs[] = {
@@ -39,12 +44,13 @@ static const struct fl_port outputs[] = {
      .summary = "datagrams the network did not take: no route, or full"},
 };
 
-enum { WITHHOLD, DATA };
+enum { WITHHOLD, SEQUENCE, DATA };
 enum { SENT, FAILED };
 
 /* A socket each: what waits for the hardware address of a computer that is gone fills its socket. */
 struct state {
     size_t open;
+    uint32_t sequence; /* in the step before; 0: nothing has come yet, or nothing is wired */
     int fd[FL_SENDERS];
     struct sockaddr_in to[FL_SENDERS];
 };
@@ -112,8 +118,10 @@ static int start(struct fl_block *block)
 static int step(struct fl_block *block)
 {
     const struct udp_send *udp = block->parameters;
-    const struct state *state = block->state;
-    if (FL_IN(block, WITHHOLD, uint8_t))
+    struct state *state = block->state;
+    uint32_t before = state->sequence;
+    state->sequence = FL_IN(block, SEQUENCE, uint32_t);
+    if (FL_IN(block, WITHHOLD, uint8_t) || (before && before == state->sequence))
         return FL_OK;
     for (size_t i = 0; i < udp->address.count; i++) {
         ssize_t sent = sendto(state->fd[i], block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,

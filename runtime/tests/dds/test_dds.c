@@ -176,6 +176,28 @@ static void leaves_no_garbage(void **state)
     testbed_end(from);
 }
 
+/* Seen to fail without the comparison. */
+static void publishes_what_is_new_alone(void **state)
+{
+    (void)state;
+    struct fl_block *from = publisher((struct node){"wrench", "n", "1", NULL, NULL});
+    assert_true(reaches(from, "written", 5, NULL));
+    for (uint32_t sequence = 1; sequence <= 3; sequence++) {
+        uint32_t before = 0;
+        SET(from, "sequence", uint32_t, sequence);
+        for (int i = 0; i < 40; i++) {
+            step(from);
+            poll(NULL, 0, PERIOD_MS);
+            if (i == 20)
+                before = GET(from, "written", uint32_t);
+        }
+        assert_int_equal(GET(from, "written", uint32_t), before);
+        SET(from, "sequence", uint32_t, 0);
+        assert_true(reaches(from, "written", before + 1, NULL));
+    }
+    testbed_end(from);
+}
+
 /* Who stands by is heard when the other is silent, and only then. */
 static void another_stands_by(void **state)
 {
@@ -375,6 +397,7 @@ int main(void)
         cmocka_unit_test(passes_each_type),
         cmocka_unit_test(hears_one_robot),
         cmocka_unit_test(leaves_no_garbage),
+        cmocka_unit_test(publishes_what_is_new_alone),
         cmocka_unit_test(another_stands_by),
         cmocka_unit_test(takes_no_other_length),
         cmocka_unit_test(qualities_are_asked_for),

@@ -169,6 +169,27 @@ static void sends_to_several_or_withholds(void **state)
     testbed_end(send);
 }
 
+/* Seen to fail without the comparison. */
+static void sends_what_is_new_alone(void **state)
+{
+    (void)state;
+    int there = bare("127.0.0.1", 0);
+    char port[8];
+    snprintf(port, sizeof port, "%u", port_of(there));
+    struct fl_block *send = testbed_block("udp-send", "address", "127.0.0.1", "port", port, "length", "1", NULL);
+    const struct {
+        uint32_t sequence, sent;
+    } steps[] = {{0, 1}, {0, 2}, {1, 3}, {1, 3}, {2, 4}, {2, 4}, {9, 5}};
+    testbed_begin(send);
+    for (size_t i = 0; i < sizeof steps / sizeof steps[0]; i++) {
+        SET(send, "sequence", uint32_t, steps[i].sequence);
+        testbed_step(send);
+        assert_int_equal(GET(send, "sent", uint32_t), steps[i].sent);
+    }
+    close(there);
+    testbed_end(send);
+}
+
 static void flags_by_age(void **state)
 {
     (void)state;
@@ -427,6 +448,7 @@ int main(void)
         cmocka_unit_test(refuses_lengths_and_senders),
         cmocka_unit_test(listens_to_the_first_that_speaks),
         cmocka_unit_test(sends_to_several_or_withholds),
+        cmocka_unit_test(sends_what_is_new_alone),
         cmocka_unit_test(flags_by_age),
         cmocka_unit_test(ages_from_arrival),
         cmocka_unit_test(stamps_survive_a_set_clock),
