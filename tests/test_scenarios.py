@@ -21,21 +21,22 @@ from images.builder.fleet import Board, Fleet
 from tests.lab.perturb import perturbed_host
 from tests.scenarios import gate, report, virtual
 from tests.scenarios.flight import HOPS, Flight
-from tests.scenarios.plans import TESTED_SIDE_M, plans, standby
+from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans, standby
 
 pytestmark = pytest.mark.boot
 
 PERIOD_US = 10_000
-ON_TIME = {"udp": 0.999, "dds": 0.995}
-"""Share of the robot's steps whose command is at the valves within the period, the lost ones counted. DDS asks now and
-then who is there, for five computers at once, and all are the guest's one processor."""
+ON_TIME = 0.999
+"""Share of the robot's steps whose command is at the valves within the period; the rest is late, and none is lost."""
 
 # Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm,
 # heading within 0.65°, thrusters 33 s of 400 s.
 RMS_M = 0.012
 HEADING_RAD = math.radians(1)
-ON_TIME_S = 2 * 8 * 10.5 * 0.01 / 0.16
+VALVES_OPEN_S = 2 * 8 * 10.5 * 0.01 / 0.16
 """Of all valves: twice what starting, turning at corners and stopping take, eight changes of a velocity by 1 cm/s."""
+PUBLISHED_VALVES_OPEN_S = 33
+"""Over the published square, which is for the most part keeping to its sides: the trial's."""
 FIRINGS_PER_S = 4
 
 TIMEOUT_S = 0.15
@@ -44,9 +45,9 @@ RECORD_S = 0.05
 """Between two records of the plant."""
 TIMEOUT_NS = round((TIMEOUT_S + RECORD_S) * 1e9)
 
-HANDOVER_S = 0.055
+HANDOVER_S = 0.0575
 """Between two commands at the valves when another computer takes over: 0.03 s until it is listened to, a period until
-it says something then, a period for the four hops, and half a one because steps without a message are that late."""
+it says something then, a period for the four hops, and three quarters because steps without a message are that late."""
 RESTART_S = 1.5
 """Until a task that was started is listened to."""
 
@@ -68,6 +69,13 @@ def flown(board: Board, session_artefacts: Path) -> dict[str, Flight]:
 
 
 @pytest.fixture(scope="module")
+def published(board: Board, session_artefacts: Path) -> dict[str, Flight]:
+    squares = [plan for plan in plans(SIDE_M) if plan.name in ("udp", "dds")]
+    directories = virtual.fly(squares, board, session_artefacts / "published")
+    return {name: Flight.read(directory) for name, directory in directories.items()}
+
+
+@pytest.fixture(scope="module")
 def stood_by(board: Board, session_artefacts: Path) -> dict[str, Flight]:
     directories = virtual.fly(standby(TESTED_SIDE_M), board, session_artefacts / "standby")
     return {name: Flight.read(directory) for name, directory in directories.items()}
@@ -84,8 +92,8 @@ def test_the_square_is_flown(flights: Callable[[str], Flight], name: str) -> Non
     square_is_flown(name, flights(name))
 
 
-def square_is_flown(name: str, flight: Flight) -> None:
-    seconds = 4 * TESTED_SIDE_M / 0.01
+def square_is_flown(name: str, flight: Flight, side_m: float = TESTED_SIDE_M, on_time_s: float = VALVES_OPEN_S) -> None:
+    seconds = 4 * side_m / 0.01
     error, thrusters = flight.error(), flight.thrusters()
     print(f"{name}: RMS {error.rms_m * 1000:.1f} mm, at most {error.max_m * 1000:.1f} mm")
     print(f"{name}: heading within {math.degrees(error.max_heading_rad):.2f}°")
@@ -93,13 +101,17 @@ def square_is_flown(name: str, flight: Flight) -> None:
     assert flight.completed
     assert error.rms_m <= RMS_M
     assert error.max_heading_rad <= HEADING_RAD
-    assert thrusters.on_time_s <= ON_TIME_S
+    assert thrusters.on_time_s <= on_time_s
     assert thrusters.firings <= FIRINGS_PER_S * seconds
 
 
 @pytest.mark.parametrize("name", ["udp", "dds"])
 def test_four_hops_take_less_than_a_period(flights: Callable[[str], Flight], name: str) -> None:
-    flight = flights(name)
+    """Seen to fail, by DDS, with an announcement to five ports of each computer: 9 steps lost, and as many late."""
+    hops_are_in_time(name, flights(name))
+
+
+def hops_are_in_time(name: str, flight: Flight) -> None:
     for index, hop in enumerate(HOPS):
         latency = flight.hop(index)
         print(f"{name}: {hop}: {latency.min_us} to {latency.max_us} µs, mean {latency.mean_us:.0f}")
@@ -107,9 +119,17 @@ def test_four_hops_take_less_than_a_period(flights: Callable[[str], Flight], nam
     print(f"{name}: four hops: {latency.min_us} to {latency.max_us} µs, mean {latency.mean_us:.0f}")
     print(f"{name}: percentiles {latency.percentiles_us}")
     on_time = sum(count for us, count in latency.histogram_us.items() if us < PERIOD_US)
-    print(f"{name}: lost {flight.lost()} of {latency.samples + flight.lost()}")
-    assert on_time >= ON_TIME[name] * (latency.samples + flight.lost())
-    assert name == "dds" or flight.lost() == 0
+    print(f"{name}: {on_time} of {latency.samples} on time; lost {flight.lost()}")
+    assert on_time >= ON_TIME * latency.samples
+    assert flight.lost() == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["udp", "dds"])
+def test_the_published_square(published: dict[str, Flight], name: str) -> None:
+    """A side of 1 m, 400 s: DDS programs announce themselves fourteen times meanwhile."""
+    square_is_flown(name, published[name], SIDE_M, PUBLISHED_VALVES_OPEN_S)
+    hops_are_in_time(name, published[name])
 
 
 def test_hops_are_the_accepted_ones(flown: dict[str, Flight]) -> None:

@@ -35,6 +35,8 @@ _FIRST_ALONE = Event(13.5, "lose", ["control-standby"])
 _STANDBY = {"robot2": "control"}
 _DDS_LATER_S = 4
 """Tasks that use DDS take that much longer to start, as long as all share one processor."""
+_ANNOUNCED_S = 36
+"""By then each DDS program has announced itself to all others once more, as it does every 28 s."""
 STATION_GONE_S = 4
 """Before the flight's end."""
 _SPIN = {"initial_velocity": [0, 0, 1]}
@@ -42,9 +44,10 @@ _SPIN = {"initial_velocity": [0, 0, 1]}
 
 
 def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
+    by_dds = square("dds", "the square, by DDS", side_m, transport="dds")
     return (
         square("udp", "the square, by UDP", side_m),
-        square("dds", "the square, by DDS", side_m, transport="dds"),
+        replace(by_dds, seconds=max(by_dds.seconds, _ANNOUNCED_S)),
         square("loss", "the square, each radio losing a tenth", side_m, events=_LOSS),
         square("disorder", "the square, packets late, out of order and twice", side_m, events=_DISORDER),
         square("gaps", "the square, one computer without power for a second, then one alone", side_m, events=_GAPS),
