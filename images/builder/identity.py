@@ -93,14 +93,16 @@ def _first_dds_port(fleet: Fleet) -> int:
     return 7400 + 250 * fleet.network.dds_domain
 
 
-def dds_peers(fleet: Fleet) -> list[str]:
-    """Where DDS looks for others: `address:port` of each robot's control tasks, and of one program more of each robot.
+def dds_peers(fleet: Fleet, robot: Robot) -> list[str]:
+    """Where a robot's DDS programs look for others: at all its own ports, and at `address:port` of each other robot's
+    control tasks and of one program more.
 
     Programs of a computer take the first port that is free, whichever they are.
     """
-    robots = sorted(fleet.robots.values(), key=lambda robot: robot.address)
-    discovery = _first_dds_port(fleet) + 10
-    return [f"{robot.address}:{discovery + 2 * n}" for robot in robots for n in range(len(robot.control_tasks) + 1)]
+    others = sorted((other for other in fleet.robots.values() if other != robot), key=lambda other: other.address)
+    first = _first_dds_port(fleet) + 10
+    ports = [f"{other.address}:{first + 2 * n}" for other in others for n in range(len(other.control_tasks) + 1)]
+    return [str(robot.address), *ports]
 
 
 def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
@@ -116,7 +118,7 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "hosts": hosts(fleet),
         "interface": fleet.interface(robot),
         "dds_ports": f"{first}-{first + 249}",
-        "dds_peers": dds_peers(fleet),
+        "dds_peers": dds_peers(fleet, robot),
         "host_keys": keys,
         "host_public_key": keys[robot.name],
         "host_private_key": (paths.KEYS / f"{robot.name}_ed25519").read_text(),

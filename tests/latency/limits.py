@@ -11,7 +11,7 @@ from tests.latency.run import VIRTUAL
 from tests.latency.scenarios import CYCLICTEST, SCENARIOS
 
 OURS, DEBIANS = "lean", "debian"
-HALF = "what ten minutes of building a kernel of one's own have to buy"
+HALF = "what six minutes of building a kernel of one's own have to buy"
 SHARE = 0.5
 """Of the latest wake-up with Debian's kernel, in the same scenarios on the same machine."""
 

@@ -39,8 +39,8 @@ def test_robots_differ_where_they_should(fleet: Fleet) -> None:
     three, four = (identity.render(fleet, fleet.robots[number]) for number in (3, 4))
     differing = {str(path) for path in three | four if three.get(path) != four.get(path)}
     assert differing == {
-        "/etc/chrony/chrony.conf", "/etc/hostname", "/etc/machine-id", "/etc/ssh/ssh_host_ed25519_key",
-        "/etc/ssh/ssh_host_ed25519_key.pub", "/etc/systemd/network/10-fleet.network",
+        "/etc/chrony/chrony.conf", "/etc/flotilla/cyclonedds.xml", "/etc/hostname", "/etc/machine-id",
+        "/etc/ssh/ssh_host_ed25519_key", "/etc/ssh/ssh_host_ed25519_key.pub", "/etc/systemd/network/10-fleet.network",
         "/etc/udev/rules.d/70-robot.rules",
     }  # fmt: skip
 
@@ -133,14 +133,15 @@ def test_stations_hear_all_and_the_first_says_where_the_robot_is() -> None:
     assert {stream.port for stream in telemetry.streams(flying)} == {5020, 5021}
 
 
-def test_dds_looks_for_each_robots_tasks_and_one_program_more() -> None:
+def test_dds_looks_for_other_robots_tasks_and_one_program_more() -> None:
     described = virtual.fleet("dds")
-    there = re.findall('<Peer Address="(.*?)"', _text(described, described.robots[1], "/etc/flotilla/cyclonedds.xml"))
-    of = {str(robot.address): len(robot.control_tasks) for robot in described.robots.values()}
     first = 7400 + 250 * described.network.dds_domain + 10
-    assert there == [f"{address}:{first + 2 * n}" for address, tasks in of.items() for n in range(tasks + 1)]
-    assert there == identity.dds_peers(described)
-    assert len(there) == 5 + 4
+    for robot in described.robots.values():
+        there = re.findall('<Peer Address="(.*?)"', _text(described, robot, "/etc/flotilla/cyclonedds.xml"))
+        of = {str(other.address): len(other.control_tasks) for other in described.robots.values() if other != robot}
+        ports = [f"{address}:{first + 2 * n}" for address, tasks in of.items() for n in range(tasks + 1)]
+        assert there == [str(robot.address), *ports]
+        assert len(ports) == 9 - (len(robot.control_tasks) + 1)
 
 
 def test_every_port_in_use_gets_its_name_and_baud_rate(fleet: Fleet) -> None:
