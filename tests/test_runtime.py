@@ -210,6 +210,20 @@ def test_steps_are_due_at_the_phase(tasks: Tasks) -> None:
     assert {row["release_ns"] % 4_000_000 for row in ended.rows} == {1_500_000}
 
 
+@pytest.mark.parametrize(
+    ("text", "period_ns", "phase_ns"),
+    [
+        ("period: 4 ms", 4_000_000, 500_000),
+        ("period: 4 ms\nphase: 0 ms", 4_000_000, 0),
+        ("period: 500 us", 500_000, 0),
+    ],
+)
+def test_steps_are_due_between_two_ticks(tasks: Tasks, text: str, period_ns: int, phase_ns: int) -> None:
+    """The kernel's are at whole milliseconds of the same clock. Seen to fail with each release at such a time."""
+    ended = tasks.run(task("a: {type: gain, in: {in: 1}}", text), "--steps", "3", "--watch", "a.out")
+    assert {row["release_ns"] % period_ns for row in ended.rows} == {phase_ns}
+
+
 def test_steps_are_counted_and_timed(tasks: Tasks) -> None:
     ended = tasks.run(
         task("a: {type: gain, in: {in: 1}}\nb: {type: gain, every: 4, in: {in: a.out}}"), "--steps", "100"

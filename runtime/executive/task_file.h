@@ -1,7 +1,7 @@
 /* A task file as it is written: what YAML says, with lines, not yet compared with the blocks that exist.
  *
  *     period: 10 ms            # ns, us, ms, s
- *     phase: 0 ms              # steps are due this long after each multiple of the period
+ *     phase: 500 us            # steps are due this long after each multiple of the period; see task_file.c
  *     trigger: gyro            # steps are due when this block has something new; the period is how often that is
  *     priority: 80             # SCHED_FIFO, 2 to 98; 0: ordinary scheduling
  *     overrun: skip            # what follows a step that ends after the next one was due: skip, catch-up, stop-safe

@@ -62,11 +62,20 @@ class Meter:
 
 # Above the load, so that it starts and ends at once whatever the load is. What measures is the thread of priority 90.
 _START = ("chrt", "--fifo", "1")
-CYCLICTEST = Meter(
-    (*_START, "cyclictest", "-q", "-m", "-p", "90", "-i", "1000", "-h", "20000", "-l", "{samples}", f"--json={OUTPUT}"),
-    {"0": "wake-up"},
-    period_ms=1,
-)
+
+
+def _cyclictest(phase_us: int) -> Meter:
+    """Wake-ups that long after each whole millisecond, when the kernel's tick may be due: in step, they are later
+    by its time, and whether they are must not be an accident of when the program started."""
+    options = f"-q -m -p 90 -i 1000 --secaligned={phase_us} -h 20000".split()
+    return Meter(
+        (*_START, "cyclictest", *options, "-l", "{samples}", f"--json={OUTPUT}"), {"0": "wake-up"}, period_ms=1
+    )
+
+
+CYCLICTEST = _cyclictest(500)
+"""In the phase of a task that says nothing about its own (`runtime/executive/task_file.c`)."""
+IN_STEP = _cyclictest(0)
 TIMERLAT = Meter(
     (*_START, "python3", f"{_FILES}/timerlat.py", "{samples}"),
     {"irq": "interrupt", "thread": "wake-up"},
@@ -133,6 +142,8 @@ SCENARIOS = (
     Scenario("files", "reading the compressed root", CYCLICTEST, FILES),
     Scenario("serial", "a serial port at 115200 Bd", CYCLICTEST, SERIAL),
     Scenario("everything", "memory, messages, network and files at once", CYCLICTEST, EVERYTHING),
+    Scenario("in-step", "idle, in step with the kernel's tick", IN_STEP),
+    Scenario("in-step-everything", "everything at once, in step with the kernel's tick", IN_STEP, EVERYTHING),
     Scenario("timerlat", "idle, by the kernel's tracer", TIMERLAT, share=1 / 6),
     Scenario(
         "timerlat-everything",
