@@ -107,7 +107,9 @@ def square_is_flown(name: str, flight: Flight, side_m: float = TESTED_SIDE_M, on
 
 @pytest.mark.parametrize("name", ["udp", "dds"])
 def test_four_hops_take_less_than_a_period(flights: Callable[[str], Flight], name: str) -> None:
-    """Seen to fail, by DDS, with an announcement to five ports of each computer: 9 steps lost, and as many late."""
+    """Seen to fail, by DDS, with an announcement to five ports of each computer: 9 steps lost, and as many late; and
+    with announcements sent and received by threads of the data's priority: 6 of 3270 late.
+    """
     hops_are_in_time(name, flights(name))
 
 

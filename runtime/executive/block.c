@@ -193,7 +193,6 @@ int fl_service_thread(struct fl_service *service, pthread_t *thread, const char 
     int error = pthread_attr_init(&attributes);
     if (error)
         return error;
-    pthread_attr_setstacksize(&attributes, 256 * 1024);
     if (service->priority) {
         pthread_attr_setinheritsched(&attributes, PTHREAD_EXPLICIT_SCHED);
         pthread_attr_setschedpolicy(&attributes, SCHED_FIFO);

@@ -2,13 +2,22 @@
 #include "privilege.h"
 
 #include <errno.h>
+#include <pthread.h>
 #include <sched.h>
 #include <stdio.h>
 #include <string.h>
 #include <sys/mman.h>
 
+enum { LIBRARY_STACK_BYTES = 256 * 1024 };
+
 void privilege_lock_memory(void)
 {
+    pthread_attr_t attributes;
+    if (!pthread_attr_init(&attributes)) {
+        pthread_attr_setstacksize(&attributes, LIBRARY_STACK_BYTES);
+        pthread_setattr_default_np(&attributes);
+        pthread_attr_destroy(&attributes);
+    }
     if (mlockall(MCL_CURRENT | MCL_FUTURE) < 0)
         fprintf(
             stderr,

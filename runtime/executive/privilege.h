@@ -3,7 +3,7 @@
 #ifndef FLOTILLA_PRIVILEGE_H
 #define FLOTILLA_PRIVILEGE_H
 
-/* Keep all memory, present and future, in RAM. */
+/* Keep all memory, present and future, in RAM: so libraries' threads have stacks of 256 kB from now on, not of 8 MB. */
 void privilege_lock_memory(void);
 
 /* `priority` where SCHED_FIFO is allowed, otherwise 0 after saying the consequence. */
