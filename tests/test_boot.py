@@ -682,7 +682,7 @@ def _edited(text: str, *changes: tuple[str, str]) -> str:
     return text
 
 
-_DDS_HOUSEKEEPING = ("recv", "tev", "gc", "lease", "dq.builtins")
+_DDS_HOUSEKEEPING = ("recv", "tev", "gc", "dq.builtins")
 """Cyclone's threads that need not be in time."""
 
 
