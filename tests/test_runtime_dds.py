@@ -43,6 +43,9 @@ blocks:
 
 PARAMETERS = "{{type: wrench, topic: wrench, robot: 2, domain: {domain}, reliability: reliable{more}}}"
 
+DOMAIN = 1 + os.getpid() % 200
+"""So that tests at the same time do not hear each other."""
+
 Start = Callable[..., Any]
 
 
@@ -59,9 +62,8 @@ def start(flotilla_run: Path, tmp_path: Path) -> Start:
 
 
 def test_a_topic_between_two_tasks(start: Start) -> None:
-    domain = 1 + os.getpid() % 200
-    sender = SENDER.format(parameters=PARAMETERS.format(domain=domain, more=""))
-    receiver = RECEIVER.format(parameters=PARAMETERS.format(domain=domain, more=", timeout: 0.5"))
+    sender = SENDER.format(parameters=PARAMETERS.format(domain=DOMAIN, more=""))
+    receiver = RECEIVER.format(parameters=PARAMETERS.format(domain=DOMAIN, more=", timeout: 0.5"))
     with start("receiver", receiver, "in.wrench,in.flag,in.sequence,in.peers") as hearing:
         assert hearing.until(lambda row: row["step"] >= 10)["flag"] == 0
         for _ in range(2):  # the second time the sender comes back
@@ -76,7 +78,7 @@ def test_a_topic_between_two_tasks(start: Start) -> None:
 
 def test_stacks_of_dds_are_small(start: Start) -> None:
     """Memory is locked, and stacks count in full. Seen to fail without the default that privilege_lock_memory sets."""
-    sender = SENDER.format(parameters=PARAMETERS.format(domain=1 + os.getpid() % 200, more=""))
+    sender = SENDER.format(parameters=PARAMETERS.format(domain=DOMAIN, more=""))
     with start("sender", sender, "out.written") as telling:
         telling.until(lambda row: row["step"] >= 10)
         own = Path(f"/proc/{telling.process.pid}")

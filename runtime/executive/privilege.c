@@ -8,13 +8,13 @@
 #include <string.h>
 #include <sys/mman.h>
 
-enum { LIBRARY_STACK_BYTES = 256 * 1024 };
+enum { THREAD_STACK_BYTES = 256 * 1024 };
 
 void privilege_lock_memory(void)
 {
     pthread_attr_t attributes;
     if (!pthread_attr_init(&attributes)) {
-        pthread_attr_setstacksize(&attributes, LIBRARY_STACK_BYTES);
+        pthread_attr_setstacksize(&attributes, THREAD_STACK_BYTES);
         pthread_setattr_default_np(&attributes);
         pthread_attr_destroy(&attributes);
     }

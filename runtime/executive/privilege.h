@@ -3,7 +3,8 @@
 #ifndef FLOTILLA_PRIVILEGE_H
 #define FLOTILLA_PRIVILEGE_H
 
-/* Keep all memory, present and future, in RAM: so libraries' threads have stacks of 256 kB from now on, not of 8 MB. */
+/* Keep all memory, present and future, in RAM. Stacks count in full then: threads made from now on, by libraries too,
+ * have 256 kB of it instead of 8 MB, unless their maker says otherwise. */
 void privilege_lock_memory(void);
 
 /* `priority` where SCHED_FIFO is allowed, otherwise 0 after saying the consequence. */

@@ -14,7 +14,8 @@
 struct fl_driver;
 
 /* Start `run(driver, context)` in a thread with locked memory, one priority below the task's: a device that floods
- * must not delay the control step. NULL after fl_fail(). */
+ * must not delay the control step. A stack has 256 kB, as have those of threads that the block's libraries make. NULL
+ * after fl_fail(). */
 struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
                                   void *context);
 
