@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import threading
@@ -65,12 +66,20 @@ class Task:
         return self.process.returncode
 
 
+def judged_by_outcomes(text: str) -> str:
+    """The task, which late steps do not end unless it says so itself: whether a computer keeps up is not its test.
+
+    Virtual time judges that. Seen to be needed with half of a processor: ten steps in a row ended late.
+    """
+    return text if re.search(r"^overruns?:", text, re.MULTILINE) else f"{text.rstrip()}\noverruns: 0\n"
+
+
 @contextmanager
 def running(
     command: list[str | Path], task: Path, text: str, environment: Mapping[str, str] | None = None
 ) -> Iterator[Task]:
     """Write a task and run it by `command`, flotilla-run and options; it ends with the context if it has not before."""
-    task.write_text(text)
+    task.write_text(judged_by_outcomes(text))
     with subprocess.Popen(
         [*command, task], stdout=subprocess.PIPE, text=True, env={**os.environ, **(environment or {})}
     ) as process:
@@ -122,7 +131,7 @@ def running_there(
     """The same on a robot, by its own flotilla-run."""
     path = f"/tmp/{name}.yml"
     command = ["env", *(f"{key}={value}" for key, value in (environment or {}).items()), "flotilla-run", *options]
-    argv = [*_AS_ROOT, "sh", "-c", _THERE, "sh", text, path, *command, path]
+    argv = [*_AS_ROOT, "sh", "-c", _THERE, "sh", judged_by_outcomes(text), path, *command, path]
     with shell.start(argv) as process:
         limit = threading.Timer(2 * PATIENCE, process.kill)  # a guest that is gone says nothing
         limit.start()
