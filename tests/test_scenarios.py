@@ -25,10 +25,6 @@ from tests.scenarios.plans import SIDE_M, TESTED_SIDE_M, plans, standby
 
 pytestmark = pytest.mark.boot
 
-PERIOD_US = 10_000
-ON_TIME = 0.999
-"""Share of the robot's steps whose command is at the valves within the period; the rest is late, and none is lost."""
-
 # Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm,
 # heading within 0.65°, thrusters 33 s of 400 s.
 RMS_M = 0.012
@@ -120,9 +116,8 @@ def hops_are_in_time(name: str, flight: Flight) -> None:
     latency = flight.latency()
     print(f"{name}: four hops: {latency.min_us} to {latency.max_us} µs, mean {latency.mean_us:.0f}")
     print(f"{name}: percentiles {latency.percentiles_us}")
-    on_time = sum(count for us, count in latency.histogram_us.items() if us < PERIOD_US)
-    print(f"{name}: {on_time} of {latency.samples} on time; lost {flight.lost()}")
-    assert on_time >= ON_TIME * latency.samples
+    print(f"{name}: {flight.late()} of {latency.samples} late; lost {flight.lost()}")
+    assert flight.faults(disturbed=False) == []
     assert flight.lost() == 0
 
 
@@ -132,6 +127,13 @@ def test_the_published_square(published: dict[str, Flight], name: str) -> None:
     """A side of 1 m, 400 s: DDS programs announce themselves fourteen times meanwhile."""
     square_is_flown(name, published[name], SIDE_M, PUBLISHED_VALVES_OPEN_S)
     hops_are_in_time(name, published[name])
+
+
+def test_no_message_arrives_before_it_is_sent(flown: dict[str, Flight]) -> None:
+    """Late and lost ones included. Seen to fail with steps that took a newer message than the one that released them:
+    a hop of -21 µs."""
+    faults = {name: flight.faults(disturbed=True) for name, flight in flown.items()}
+    assert not any(faults.values()), faults
 
 
 def test_hops_are_the_accepted_ones(flown: dict[str, Flight]) -> None:

@@ -40,6 +40,13 @@ def _fly(names: list[str], side_m: float) -> None:
     flown = _flown(chosen)
     page = report.write({there[name].title: flight for name, flight in flown.items()}, paths.BUILD / "reports")
     print(f"{paths.shown(page)}; what each task said and recorded: {paths.shown(OUT)}/flights")
+    faults = [
+        f"{there[name].title}: {fault}"
+        for name, flight in flown.items()
+        for fault in flight.faults(disturbed=there[name].disturbed)
+    ]
+    if faults:
+        raise UserError("\n".join(faults))
 
 
 def _fly_guests(names: list[str], side_m: float) -> None:

@@ -18,6 +18,9 @@ HOPS = ("sensors → navigation", "navigation → control", "control → thruste
 _STAMPS = ("sensed_ns", "navigation_ns", "control_ns", "mapping_ns", "valves_ns")
 """When a step's message was sent by the first task, and arrived at each of the others."""
 
+LIMIT_US = 10_000
+"""Of the four hops of a flight that nothing disturbs: the period, within which the published laboratory had them."""
+
 Record = dict[str, Any]
 
 
@@ -128,6 +131,28 @@ class Flight:
     def latency(self) -> Latency:
         """From when the sensors' step was due until the valves are switched: four hops."""
         return _latency([step["now_ns"] + step["offset_ns"] - step["sensed_ns"] for step in self.arrived])
+
+    def late(self) -> int:
+        """Steps whose command arrived, after `LIMIT_US`."""
+        return sum(count for us, count in self.latency().histogram_us.items() if us >= LIMIT_US)
+
+    def faults(self, *, disturbed: bool) -> list[str]:
+        """What no flight in virtual time may show; of an undisturbed one also what took longer than the limit."""
+        if not self.one_clock:
+            return []
+        found = []
+        for index, name in enumerate(HOPS):
+            hop = self.hop(index)
+            before = sum(count for us, count in hop.histogram_us.items() if us < 0)
+            if before:
+                found.append(
+                    f"{name}: {before} of {hop.samples} messages arrived before they were sent, {hop.min_us} µs"
+                )
+        if self.late() and not disturbed:
+            whole = self.latency()
+            late = f"{self.late()} of {whole.samples} steps took {LIMIT_US} µs or more"
+            found.append(f"four hops: {late}, {whole.max_us} µs at most")
+        return found
 
     def lost(self) -> int:
         """Of the robot's steps, from the first whose command arrived to the last: those whose did not."""

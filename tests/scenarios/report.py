@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tests.scenarios.crowd import Crowd
-from tests.scenarios.flight import HOPS, Flight
+from tests.scenarios.flight import HOPS, LIMIT_US, Flight
 
 _BLUE, _GREY, _RED = "#1a6bb5", "#999999", "#c8501e"
 _SIZE = (5.4, 3.6)
@@ -46,7 +46,7 @@ def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios
     page.write_text(
         _environment()
         .get_template("report.html.j2")
-        .render(figures=figures, pictures=pictures, hops=hops, how=how, degrees=math.degrees)
+        .render(figures=figures, pictures=pictures, hops=hops, how=how, degrees=math.degrees, limit_us=LIMIT_US)
     )
     return page
 
@@ -103,6 +103,7 @@ def summary(flight: Flight) -> dict[str, object]:
     found: dict[str, object] = {
         "steps": len(flight.arrived) + flight.lost(),
         "lost": flight.lost(),
+        "late": flight.late(),
         "latency_us": latency.model_dump(mode="json"),
     }
     if flight.statistics:

@@ -82,6 +82,11 @@ class Plan:
     changes: Mapping[str, object] = field(default_factory=dict)
     """Parameters of control tasks that are not those of their files, by `task.block.parameter`."""
 
+    @property
+    def disturbed(self) -> bool:
+        """Something happens that delays or loses messages on purpose."""
+        return bool(self.events or self.stranger)
+
 
 def square(name: str, title: str, side_m: float, **more: Any) -> Plan:
     """Once around a square at 1 cm/s, as published (there 1 m), after some seconds for the tasks to begin."""

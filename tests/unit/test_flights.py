@@ -1,0 +1,66 @@
+"""What a flight's figures may not show, and how the report marks it. No QEMU."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.scenarios import report
+from tests.scenarios.flight import Flight, Record
+
+PERIOD_NS = 10_000_000
+
+
+def flight(*four_hops_us: int, last_hop_us: int = 100) -> Flight:
+    """A step for each latency; only what the hops' figures need."""
+
+    def step(number: int, latency_us: int) -> Record:
+        sensed_ns = number * PERIOD_NS
+        valves_ns = sensed_ns + latency_us * 1000
+        mapping_ns = valves_ns - last_hop_us * 1000
+        return {
+            "sequence": number, "number": number, "sensed_ns": sensed_ns, "navigation_ns": sensed_ns + 100_000,
+            "control_ns": sensed_ns + 200_000, "mapping_ns": mapping_ns, "valves_ns": valves_ns,
+            "now_ns": valves_ns, "offset_ns": 0, "time_ns": valves_ns,
+        }  # fmt: skip
+
+    still = {"pose": (0, 0, 0), "velocity": (0, 0, 0), "on_time": [0] * 8, "switches": [0] * 8}
+    return Flight(
+        [still | {"time_ns": end * PERIOD_NS} for end in range(2)],
+        [step(number, us) for number, us in enumerate(four_hops_us, 1)],
+        [],
+    )
+
+
+def test_a_flight_within_the_limit_has_no_faults() -> None:
+    assert flight(2000, 9999).faults(disturbed=False) == []
+
+
+def test_what_takes_a_period_is_late() -> None:
+    found = flight(2000, 10_000, 10_970)
+    assert found.late() == 2
+    assert found.faults(disturbed=False) == ["four hops: 2 of 3 steps took 10000 µs or more, 10970 µs at most"]
+    assert found.faults(disturbed=True) == [], "it was delayed on purpose"
+
+
+@pytest.mark.parametrize("disturbed", [True, False])
+def test_a_message_cannot_arrive_before_it_was_sent(disturbed: bool) -> None:
+    assert flight(2000, 3000, last_hop_us=-21).faults(disturbed=disturbed) == [
+        "thruster mapping → valves: 2 of 2 messages arrived before they were sent, -21 µs"
+    ]
+
+
+def test_clocks_of_several_computers_are_not_compared() -> None:
+    found = flight(12_000, last_hop_us=-21)
+    found.one_clock = False
+    assert found.faults(disturbed=False) == []
+
+
+def test_the_page_marks_what_is_late_and_what_cannot_be(tmp_path: Path) -> None:
+    def marks(found: Flight) -> int:
+        return report.write({"square": found}, tmp_path).read_text().count('class="missed"')
+
+    assert marks(flight(2000)) == 0
+    assert marks(flight(12_000)) == 2
+    assert marks(flight(2000, last_hop_us=-21)) == 1
