@@ -280,6 +280,31 @@ static void a_missed_deadline_is_no_good(void **state)
     testbed_end(to);
 }
 
+/* Another robot's samples, which come by the same topic, end: that is no deadline of the one that is listened to.
+ * Whether the host keeps up with the deadline does not matter, as the age says. */
+static void a_deadline_is_of_one_robot(void **state)
+{
+    (void)state;
+    struct fl_block *one = publisher((struct node){"state", "e", "1", "deadline", "0.1"});
+    struct fl_block *two = publisher((struct node){"state", "e", "2", "deadline", "0.1"});
+    struct fl_block *to = subscriber((struct node){"state", "e", "2,1", "deadline", "0.1"});
+    assert_true(reaches(to, "sender", 1, one));
+    assert_true(reaches(to, "sender", 0, two));
+    unsigned good = 0;
+    for (int i = 0; i < 150; i++) {
+        step(two);
+        poll(NULL, 0, PERIOD_MS);
+        step(to);
+        bool in_time = GET(to, "age", double) <= 0.1;
+        assert_int_equal(GET(to, "flag", uint8_t), in_time);
+        good += in_time;
+    }
+    assert_true(good > 0);
+    testbed_end(one);
+    testbed_end(two);
+    testbed_end(to);
+}
+
 static void is_patient_without_a_peer(void **state)
 {
     (void)state;
@@ -402,6 +427,7 @@ int main(void)
         cmocka_unit_test(takes_no_other_length),
         cmocka_unit_test(qualities_are_asked_for),
         cmocka_unit_test(a_missed_deadline_is_no_good),
+        cmocka_unit_test(a_deadline_is_of_one_robot),
         cmocka_unit_test(is_patient_without_a_peer),
         cmocka_unit_test(runs_on_without_dds),
         cmocka_unit_test(the_configuration_is_obeyed),
