@@ -101,7 +101,7 @@ static void run(struct fl_driver *driver, void *context)
 {
     static const struct dds_endpoint endpoint = {dds_create_reader, set_listener, serve};
     struct state *state = context;
-    dds_run(&endpoint, &state->settings, state->block, driver, state);
+    dds_run(&endpoint, &state->settings, 0, state->block, driver, state);
 }
 
 static int configure(struct fl_block *block)
