@@ -68,16 +68,18 @@ static bool filter_calls(void)
         ALLOW_WITH(SYS_sendmsg, 2, MSG_DONTWAIT),
         ALLOW_WITH(SYS_recvfrom, 3, MSG_DONTWAIT),
         ALLOW_WITH(SYS_recvmsg, 2, MSG_DONTWAIT),
+        ALLOW(SYS_getsockopt),
         ALLOW_EQUAL(SYS_futex, 1, FUTEX_WAKE_PRIVATE),
         ALLOW_EQUAL(SYS_write, 0, report_fd),
 #ifdef SYS_socketcall
         /* The C library's way on i386; the flags lie in memory, out of a filter's sight. */
-        SKIP_UNLESS(SYS_socketcall, 9),
+        SKIP_UNLESS(SYS_socketcall, 11),
         LOAD(FIELD(args[0])),
         ALLOW(SYS_SENDTO),
         ALLOW(SYS_SENDMSG),
         ALLOW(SYS_RECVFROM),
         ALLOW(SYS_RECVMSG),
+        ALLOW(SYS_GETSOCKOPT),
 #endif
         VERDICT(SECCOMP_RET_TRAP),
     };

@@ -2,6 +2,7 @@
 #include "topic.h"
 
 #include <errno.h>
+#include <math.h>
 #include <stdatomic.h>
 #include <string.h>
 #include <sys/socket.h>
@@ -13,6 +14,7 @@ enum { WAITING = 4 };
 struct dds_publish {
     struct dds_settings common;
     int64_t robot;
+    double lifespan;
 };
 
 struct state {
@@ -31,6 +33,8 @@ struct state {
 static const struct fl_parameter parameters[] = {
     DDS_PARAMETERS(struct dds_settings),
     FL_PARAMETER(struct dds_publish, robot, .min = 0, .max = 65535, .summary = "number of the robot that sends"),
+    FL_PARAMETER(struct dds_publish, lifespan, .fallback = "0.1", .min = 0.001, .max = 3600, .unit = "s",
+                 .summary = "a sample that is older is not sent, nor sent again: it would look new where it arrives"),
 };
 
 enum { WITHHOLD, SEQUENCE, DATA };
@@ -56,16 +60,18 @@ static void matched(dds_entity_t writer, const dds_publication_matched_status_t 
     atomic_store(&state->peers, status.current_count);
 }
 
-/* The newest that waits is written; those before it are worth nothing any more. */
+/* The newest that waits is written; those before it are worth nothing any more, nor is what waited too long: for DDS,
+ * or for a process that was stopped. */
 static void write_newest(struct state *state, dds_entity_t writer)
 {
+    const struct dds_publish *set = state->block->parameters;
     char tokens[64];
     bool any = false;
     while (recv(state->wake[1], tokens, sizeof tokens, MSG_DONTWAIT) > 0)
         ;
     while (fl_ring_take(&state->samples, &state->taken))
         any = true;
-    if (!any)
+    if (!any || fl_now_ns() - state->taken.made_ns > llround(set->lifespan * 1e9))
         return;
     dds_encode(&state->settings, &state->taken, state->storage);
     if (dds_write(writer, state->storage) == DDS_RETCODE_OK)
@@ -102,7 +108,8 @@ static void run(struct fl_driver *driver, void *context)
 {
     static const struct dds_endpoint endpoint = {dds_create_writer, set_listener, serve};
     struct state *state = context;
-    dds_run(&endpoint, &state->settings, state->block, driver, state);
+    const struct dds_publish *set = state->block->parameters;
+    dds_run(&endpoint, &state->settings, set->lifespan, state->block, driver, state);
 }
 
 static int configure(struct fl_block *block)
@@ -136,6 +143,7 @@ static int step(struct fl_block *block)
         struct dds_sample sample = {.robot = (uint16_t)set->robot, .number = state->number++};
         struct timespec real;
         clock_gettime(CLOCK_REALTIME, &real);
+        sample.made_ns = fl_now_ns();
         sample.stamp_ns = real.tv_sec * INT64_C(1000000000) + real.tv_nsec;
         memcpy(sample.values, block->in[DATA], dds_value_bytes(&state->settings));
         if (fl_ring_put(&state->samples, &sample))

@@ -28,7 +28,6 @@ struct state {
     int arrived_fd;                    /* readable after something was put into the ring */
     bool open, held;                   /* held: the next step finds its first sample in `taken` */
     _Atomic uint32_t peers;
-    _Atomic bool late; /* the deadline passed since the last sample */
     struct fl_sensor sensor;
 };
 
@@ -47,14 +46,6 @@ static void matched(dds_entity_t reader, const dds_subscription_matched_status_t
     struct state *state = context;
     (void)reader;
     atomic_store(&state->peers, status.current_count);
-}
-
-static void missed(dds_entity_t reader, const dds_requested_deadline_missed_status_t status, void *context)
-{
-    struct state *state = context;
-    (void)reader;
-    (void)status;
-    atomic_store(&state->late, true);
 }
 
 /* The place of the sample's robot among those that are listened to, or their number. */
@@ -84,7 +75,6 @@ static void arrived(dds_entity_t reader, void *context)
                 continue;
             state->arriving.sender = (uint32_t)rank;
             state->arriving.arrived_ns = now_ns;
-            atomic_store(&state->late, false);
             fl_ring_put(&state->samples, &state->arriving);
             eventfd_write(state->arrived_fd, 1);
         }
@@ -97,7 +87,6 @@ static void set_listener(dds_listener_t *listener)
 {
     dds_lset_data_available(listener, arrived);
     dds_lset_subscription_matched(listener, matched);
-    dds_lset_requested_deadline_missed(listener, missed);
 }
 
 /* DDS's own thread calls the listener. */
@@ -112,7 +101,7 @@ static void run(struct fl_driver *driver, void *context)
 {
     static const struct dds_endpoint endpoint = {dds_create_reader, set_listener, serve};
     struct state *state = context;
-    dds_run(&endpoint, &state->settings, state->block, driver, state);
+    dds_run(&endpoint, &state->settings, 0, state->block, driver, state);
 }
 
 static int configure(struct fl_block *block)
@@ -182,7 +171,9 @@ static int step(struct fl_block *block)
         fl_sensor_update(&state->sensor, state->taken.arrived_ns, state->sensor.sequence + 1);
     }
     FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
-    fl_sensor_outputs(&state->sensor, block, FLAG, !atomic_load(&state->late), set->timeout);
+    /* By the age of what was taken: DDS's own status tells of any robot whose samples come by the topic. */
+    const double deadline = set->common.deadline;
+    fl_sensor_outputs(&state->sensor, block, FLAG, true, deadline > 0 ? fmin(deadline, set->timeout) : set->timeout);
     return FL_OK;
 }
 

@@ -132,7 +132,7 @@ static void release_participant(uint32_t domain)
 
 enum { RETRY_MS = 1000 };
 
-static dds_qos_t *qualities_of(const struct dds_settings *settings)
+static dds_qos_t *qualities_of(const struct dds_settings *settings, double lifespan)
 {
     dds_qos_t *qualities = dds_create_qos();
     dds_qset_history(qualities, DDS_HISTORY_KEEP_LAST, 1); /* control wants the newest or none */
@@ -140,15 +140,17 @@ static dds_qos_t *qualities_of(const struct dds_settings *settings)
                          DDS_MSECS(100));
     if (settings->deadline > 0)
         dds_qset_deadline(qualities, llround(settings->deadline * 1e9));
+    if (settings->reliability && lifespan > 0) /* best effort keeps nothing that could be sent again */
+        dds_qset_lifespan(qualities, llround(lifespan * 1e9));
     return qualities;
 }
 
 /* Until the thread shall return: true; or false when DDS cannot be had now. */
-static bool serve(const struct dds_endpoint *endpoint, const struct dds_settings *settings, struct fl_block *block,
-                  struct fl_driver *driver, void *context, dds_entity_t participant)
+static bool serve(const struct dds_endpoint *endpoint, const struct dds_settings *settings, double lifespan,
+                  struct fl_block *block, struct fl_driver *driver, void *context, dds_entity_t participant)
 {
     dds_listener_t *listener = dds_create_listener(context);
-    dds_qos_t *qualities = qualities_of(settings);
+    dds_qos_t *qualities = qualities_of(settings, lifespan);
     endpoint->set_listener(listener);
     dds_entity_t topic = dds_create_topic(participant, types[settings->type].descriptor, settings->topic, NULL, NULL);
     dds_entity_t entity = topic < 0 ? topic : endpoint->create(participant, topic, qualities, listener);
@@ -165,8 +167,8 @@ static bool serve(const struct dds_endpoint *endpoint, const struct dds_settings
     return entity >= 0;
 }
 
-void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, struct fl_block *block,
-             struct fl_driver *driver, void *context)
+void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, double lifespan,
+             struct fl_block *block, struct fl_driver *driver, void *context)
 {
     uint32_t domain = (uint32_t)settings->domain;
     do {
@@ -175,7 +177,7 @@ void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *set
             fl_log(block, "DDS domain %u: %s", (unsigned)domain, dds_strretcode(participant));
             continue;
         }
-        bool done = serve(endpoint, settings, block, driver, context, participant);
+        bool done = serve(endpoint, settings, lifespan, block, driver, context, participant);
         release_participant(domain);
         if (done)
             return;

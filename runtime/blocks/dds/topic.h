@@ -17,7 +17,8 @@ struct dds_sample {
     uint32_t number;
     uint32_t sender;    /* its rank, where it arrives */
     int64_t stamp_ns;   /* the sender's CLOCK_REALTIME */
-    int64_t arrived_ns; /* CLOCK_MONOTONIC */
+    int64_t made_ns;    /* CLOCK_MONOTONIC, of one that goes out */
+    int64_t arrived_ns; /* CLOCK_MONOTONIC, of one that came */
     _Alignas(8) uint8_t values[DDS_VALUES];
 };
 
@@ -62,8 +63,9 @@ struct dds_endpoint {
     void (*serve)(void *context, struct fl_driver *driver, dds_entity_t entity); /* until the thread shall return */
 };
 
-/* What a block's thread does: have the endpoint, and serve it; try again while DDS cannot be had. */
-void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, struct fl_block *block,
-             struct fl_driver *driver, void *context);
+/* What a block's thread does: have the endpoint, and serve it; try again while DDS cannot be had. `lifespan` of a
+ * writer's samples, in s: 0 is for readers. */
+void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, double lifespan,
+             struct fl_block *block, struct fl_driver *driver, void *context);
 
 #endif

@@ -44,7 +44,7 @@ static int start(struct fl_block *block)
     struct state *state = block->state;
     fl_sensor_begin(&state->sensor);
     return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from,
-                             igps->failover);
+                             igps->failover, IGPS_BYTES);
 }
 
 static int step(struct fl_block *block)
@@ -54,7 +54,7 @@ static int step(struct fl_block *block)
     uint8_t bytes[IGPS_BYTES];
     int64_t arrived_ns;
     int budget = UDP_BURST;
-    while (udp_receive(&state->receiver, bytes, sizeof bytes, &arrived_ns, &budget)) {
+    while (udp_receive(&state->receiver, bytes, &arrived_ns, &budget)) {
         struct igps_position position;
         /* A right datagram with a number that cannot be is the system saying that it does not see the robot; one of
          * another length is not of the system, and says nothing. */

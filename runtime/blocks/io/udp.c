@@ -4,6 +4,8 @@
 #include <arpa/inet.h>
 #include <errno.h>
 #include <inttypes.h>
+#include <linux/filter.h>
+#include <linux/sock_diag.h>
 #include <linux/time_types.h>
 #include <net/if.h>
 #include <string.h>
@@ -46,7 +48,51 @@ static int fail_to_bind(struct fl_block *block, const char *local_address, int64
     return fl_fail(block, "cannot bind UDP port %" PRId64 ": %s", port, strerror(errno));
 }
 
-int udp_open(struct fl_block *block, const char *local_address, int64_t port, const char *interface)
+/* What passes a receiver: datagrams of its length, from one of its senders. Run by the kernel before a datagram joins
+ * the queue, so what others send takes neither its room nor the step's time. The packet begins with the UDP header
+ * (linux/Documentation/networking/filter.rst). */
+struct filter {
+    struct sock_filter code[FL_SENDERS + 5];
+    unsigned short count;
+};
+
+static struct filter filter_of(const struct in_addr *from, size_t count, size_t length)
+{
+    enum { UDP_HEADER = 8, IP_SOURCE = 12 };
+    struct filter filter = {.count = 0};
+    bool anybody = from[0].s_addr == INADDR_ANY;
+    if (!anybody) {
+        filter.code[filter.count++] =
+            (struct sock_filter)BPF_STMT(BPF_LD | BPF_W | BPF_ABS, (unsigned)SKF_NET_OFF + IP_SOURCE);
+        /* To the length, past the senders that are left and the refusal. */
+        for (size_t i = 0; i < count; i++)
+            filter.code[filter.count++] = (struct sock_filter)BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, ntohl(from[i].s_addr),
+                                                                       (unsigned char)(count - i), 0);
+        filter.code[filter.count++] = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, 0);
+    }
+    filter.code[filter.count++] = (struct sock_filter)BPF_STMT(BPF_LD | BPF_W | BPF_LEN, 0);
+    filter.code[filter.count++] =
+        (struct sock_filter)BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (unsigned)length + UDP_HEADER, 0, 1);
+    filter.code[filter.count++] = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, UINT32_MAX);
+    filter.code[filter.count++] = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, 0);
+    return filter;
+}
+
+/* `receiver`: NULL where the socket only sends. */
+static bool set_up(int fd, const struct udp_receiver *receiver)
+{
+    static const int on = 1;
+    if (!receiver)
+        return true;
+    struct filter filter = filter_of(receiver->from, receiver->from_count, receiver->length);
+    const struct sock_fprog program = {filter.count, filter.code};
+    /* The new time stamp has 64 bits on i386 too. */
+    return setsockopt(fd, SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program) == 0 &&
+           setsockopt(fd, SOL_SOCKET, SO_TIMESTAMPNS_NEW, &on, sizeof on) == 0;
+}
+
+int udp_open(struct fl_block *block, const char *local_address, int64_t port, const char *interface,
+             const struct udp_receiver *receiver)
 {
     struct sockaddr_in local = {.sin_family = AF_INET, .sin_port = htons((uint16_t)port)};
     if (udp_read_address(block, "local_address", local_address, &local.sin_addr) != FL_OK)
@@ -62,6 +108,8 @@ int udp_open(struct fl_block *block, const char *local_address, int64_t port, co
     }
     if (*interface && setsockopt(fd, SOL_SOCKET, SO_BINDTODEVICE, interface, (socklen_t)strlen(interface)) < 0)
         fl_fail(block, "cannot bind to network interface %s: %s", interface, strerror(errno));
+    else if (!set_up(fd, receiver)) /* before it has a port: nothing comes past the filter */
+        fl_fail(block, "cannot set up the UDP socket: %s", strerror(errno));
     else if (bind(fd, (struct sockaddr *)&local, sizeof local) < 0)
         fail_to_bind(block, local_address, port);
     else
@@ -79,23 +127,16 @@ int udp_receiver_check(struct fl_block *block, const char *local_address, struct
 }
 
 int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
-                      const char *interface, struct fl_texts from, double failover)
+                      const char *interface, struct fl_texts from, double failover, size_t length)
 {
-    static const int on = 1;
-    *receiver =
-        (struct udp_receiver){.emptied_ns = fl_now_ns(), .from_count = from.count, .failover_timeout = failover};
+    *receiver = (struct udp_receiver){
+        .emptied_ns = fl_now_ns(), .from_count = from.count, .failover_timeout = failover, .length = length};
     fl_failover_begin(&receiver->failover, receiver->emptied_ns);
     if (udp_read_addresses(block, "from", from, receiver->from) != FL_OK)
         return FL_FAILED;
-    receiver->fd = udp_open(block, local_address, port, interface);
-    if (receiver->fd < 0)
-        return FL_FAILED;
-    receiver->open = true;
-    /* The new time stamp has 64 bits on i386 too. */
-    if (setsockopt(receiver->fd, SOL_SOCKET, SO_TIMESTAMPNS_NEW, &on, sizeof on) < 0 ||
-        setsockopt(receiver->fd, SOL_SOCKET, SO_RXQ_OVFL, &on, sizeof on) < 0)
-        return fl_fail(block, "the kernel cannot stamp datagrams: %s", strerror(errno));
-    return FL_OK;
+    receiver->fd = udp_open(block, local_address, port, interface, receiver);
+    receiver->open = receiver->fd >= 0;
+    return receiver->open ? FL_OK : FL_FAILED;
 }
 
 int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns)
@@ -113,39 +154,49 @@ static int64_t wall_ns(void)
     return wall.tv_sec * INT64_C(1000000000) + wall.tv_nsec;
 }
 
-static int64_t read_control(struct udp_receiver *receiver, struct msghdr *message)
+static int64_t read_stamp(struct msghdr *message)
 {
-    int64_t stamp_ns = INT64_MAX; /* as if just now */
     for (struct cmsghdr *control = CMSG_FIRSTHDR(message); control; control = CMSG_NXTHDR(message, control)) {
-        if (control->cmsg_level != SOL_SOCKET)
-            continue;
-        if (control->cmsg_type == SO_TIMESTAMPNS_NEW) {
+        if (control->cmsg_level == SOL_SOCKET && control->cmsg_type == SO_TIMESTAMPNS_NEW) {
             struct __kernel_timespec stamp;
             memcpy(&stamp, CMSG_DATA(control), sizeof stamp);
-            stamp_ns = stamp.tv_sec * INT64_C(1000000000) + stamp.tv_nsec;
-        } else if (control->cmsg_type == SO_RXQ_OVFL) {
-            memcpy(&receiver->dropped, CMSG_DATA(control), sizeof receiver->dropped);
+            return stamp.tv_sec * INT64_C(1000000000) + stamp.tv_nsec;
         }
     }
-    return stamp_ns;
+    return INT64_MAX; /* as if just now */
 }
 
-/* The sender's place in `from`, or its length. */
+/* The kernel has one count for what its filter refused and for what found no room. The queue has no room only while it
+ * is full, and only reading empties it: before anything is read it tells which of the two it was. */
+static void count_lost(struct udp_receiver *receiver)
+{
+    enum { DATAGRAM = 4096 }; /* memory that the kernel charges for one, at most */
+    uint32_t now[SK_MEMINFO_VARS] = {0};
+    socklen_t size = sizeof now;
+    if (getsockopt(receiver->fd, SOL_SOCKET, SO_MEMINFO, now, &size) < 0)
+        return;
+    bool full = now[SK_MEMINFO_RMEM_ALLOC] + DATAGRAM > now[SK_MEMINFO_RCVBUF];
+    *(full ? &receiver->dropped : &receiver->refused) += now[SK_MEMINFO_DROPS] - receiver->lost;
+    receiver->lost = now[SK_MEMINFO_DROPS];
+}
+
+/* The sender's place in `from`: the filter lets no other one pass. */
 static size_t rank_of(const struct udp_receiver *receiver, const struct sockaddr_in *sender)
 {
     size_t rank = 0;
-    while (rank < receiver->from_count && receiver->from[rank].s_addr != INADDR_ANY &&
-           receiver->from[rank].s_addr != sender->sin_addr.s_addr)
+    while (rank + 1 < receiver->from_count && receiver->from[rank].s_addr != sender->sin_addr.s_addr)
         rank++;
     return rank;
 }
 
-bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int64_t *arrived_ns, int *budget)
+bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, int *budget)
 {
+    if (*budget == UDP_BURST)
+        count_lost(receiver);
     while ((*budget)-- > 0) {
-        _Alignas(struct cmsghdr) char control[CMSG_SPACE(sizeof(struct __kernel_timespec)) + CMSG_SPACE(4)];
+        _Alignas(struct cmsghdr) char control[CMSG_SPACE(sizeof(struct __kernel_timespec))];
         struct sockaddr_in sender = {0};
-        struct iovec part = {bytes, length};
+        struct iovec part = {bytes, receiver->length};
         struct msghdr message = {.msg_name = &sender,
                                  .msg_namelen = sizeof sender,
                                  .msg_iov = &part,
@@ -153,19 +204,13 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int6
                                  .msg_control = control,
                                  .msg_controllen = sizeof control};
         int64_t before_ns = fl_now_ns();
-        ssize_t got = recvmsg(receiver->fd, &message, MSG_DONTWAIT | MSG_TRUNC);
+        ssize_t got = recvmsg(receiver->fd, &message, MSG_DONTWAIT);
         if (got < 0 && errno == EAGAIN)
             receiver->emptied_ns = before_ns;
-        if (got < 0) {
-            *budget = 0;
-            return false;
-        }
-        int64_t stamp_ns = read_control(receiver, &message);
+        if (got < 0)
+            break;
         size_t rank = rank_of(receiver, &sender);
-        if ((size_t)got != length || rank == receiver->from_count) {
-            receiver->refused++;
-            continue;
-        }
+        int64_t stamp_ns = read_stamp(&message);
         /* In this order: what delays between the two lets the datagram look older, never younger. */
         int64_t now_ns = fl_now_ns();
         int64_t came_ns = udp_arrival_ns(stamp_ns, wall_ns(), now_ns, receiver->emptied_ns);

@@ -44,9 +44,12 @@ int udp_read_address(struct fl_block *block, const char *parameter, const char *
 /* The same for a list of 1 to FL_SENDERS addresses, in which 0.0.0.0 stands alone. */
 int udp_read_addresses(struct fl_block *block, const char *parameter, struct fl_texts texts, struct in_addr *addresses);
 
+struct udp_receiver;
+
 /* A socket bound to this computer's address, a port (0: any free one) and an interface: descriptor, or -1 after
- * fl_fail(). */
-int udp_open(struct fl_block *block, const char *local_address, int64_t port, const char *interface);
+ * fl_fail(). With a receiver, datagrams of its length and senders alone come in; with NULL the socket is to send. */
+int udp_open(struct fl_block *block, const char *local_address, int64_t port, const char *interface,
+             const struct udp_receiver *receiver);
 
 /* --- receiving --- */
 
@@ -55,16 +58,18 @@ struct udp_receiver {
     int fd;
     struct in_addr from[FL_SENDERS];
     size_t from_count;
+    size_t length;   /* bytes of a datagram */
     uint32_t sender; /* of the datagram that was taken last: its place in `from` */
     struct fl_failover failover;
     double failover_timeout;
     int64_t emptied_ns; /* when last nothing waited: what comes later has arrived later */
-    uint32_t dropped;   /* by the kernel, for want of room */
-    uint32_t refused;   /* of another length, or from none of `from` */
+    uint32_t lost;      /* by the kernel's count, whatever the reason */
+    uint32_t dropped;   /* of these, for want of room */
+    uint32_t refused;   /* of these, of another length, or from none of `from` */
 };
 
 #define UDP_RECEIVER_OUTPUTS                                                                                           \
-    {.name = "dropped", .type = FL_UINT32, .width = 1, .summary = "datagrams that the kernel had no room for"},        \
+    {.name = "dropped", .type = FL_UINT32, .width = 1, .summary = "datagrams lost while the queue was full"},          \
         {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "datagrams of another length or sender"},        \
         {.name = "sender", .type = FL_UINT32, .width = 1, .summary = "who is listened to: 0 is the first of `from`"}
 
@@ -72,7 +77,7 @@ struct udp_receiver {
 int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_texts from);
 
 int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
-                      const char *interface, struct fl_texts from, double failover);
+                      const char *interface, struct fl_texts from, double failover, size_t length);
 
 /* Write the outputs UDP_RECEIVER_OUTPUTS, of which `dropped` is number `first`. */
 void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *block, uint32_t first);
@@ -81,11 +86,11 @@ void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *
  * comes out of that wrong is kept between what is known for sure, after the queue was last empty and before now. */
 int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns);
 
-/* Take the next datagram, which must be of `length` bytes and is refused otherwise. Each call takes one off `budget`,
+/* Take the next datagram, which has the receiver's length and one of its senders. Each call takes one off `budget`,
  * UDP_BURST at the begin of a step, and there is none for a budget of 0. `arrived_ns` is when the kernel got it
  * (SO_TIMESTAMPNS, see socket(7)), on CLOCK_MONOTONIC; in the first moments after the first socket of a computer asked
  * for stamps, when it was read. */
-bool udp_receive(struct udp_receiver *receiver, void *bytes, size_t length, int64_t *arrived_ns, int *budget);
+bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, int *budget);
 
 void udp_receiver_close(struct udp_receiver *receiver);
 

@@ -56,17 +56,16 @@ static int start(struct fl_block *block)
     if (!state->scratch)
         return FL_FAILED;
     return udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from,
-                             udp->failover);
+                             udp->failover, (size_t)udp->length);
 }
 
-/* What is refused is no reason for a step. */
+/* What is not listened to is no reason for a step. */
 static int64_t await(struct fl_block *block, int64_t until_ns)
 {
-    const struct udp_receive *udp = block->parameters;
     struct state *state = block->state;
     do {
         int budget = UDP_BURST;
-        if (udp_receive(&state->receiver, state->scratch, (size_t)udp->length, &state->arrived_ns, &budget))
+        if (udp_receive(&state->receiver, state->scratch, &state->arrived_ns, &budget))
             return state->arrived_ns;
         state->arrived_ns = 0;
     } while (fl_await_readable(state->receiver.fd, until_ns));
@@ -78,8 +77,7 @@ static int step(struct fl_block *block)
     const struct udp_receive *udp = block->parameters;
     struct state *state = block->state;
     int budget = UDP_BURST;
-    while (state->arrived_ns ||
-           udp_receive(&state->receiver, state->scratch, (size_t)udp->length, &state->arrived_ns, &budget)) {
+    while (state->arrived_ns || udp_receive(&state->receiver, state->scratch, &state->arrived_ns, &budget)) {
         memcpy(block->out[DATA], state->scratch, (size_t)udp->length);
         fl_sensor_update(&state->sensor, state->arrived_ns, state->sensor.sequence + 1);
         state->arrived_ns = 0;

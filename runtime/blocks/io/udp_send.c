@@ -104,7 +104,7 @@ static int start(struct fl_block *block)
             return FL_FAILED;
     }
     for (size_t i = 0; i < udp->address.count; i++) {
-        state->fd[i] = udp_open(block, udp->local_address, 0, udp->interface);
+        state->fd[i] = udp_open(block, udp->local_address, 0, udp->interface, NULL);
         if (state->fd[i] < 0)
             return FL_FAILED;
         state->open++;

@@ -3,6 +3,7 @@
 #include "seccomp.h"
 #include "testbed.h"
 
+#include <dds/dds.h>
 #include <dirent.h>
 #include <limits.h>
 #include <poll.h>
@@ -280,6 +281,31 @@ static void a_missed_deadline_is_no_good(void **state)
     testbed_end(to);
 }
 
+/* Another robot's samples, which come by the same topic, end: that is no deadline of the one that is listened to.
+ * Whether the host keeps up with the deadline does not matter, as the age says. */
+static void a_deadline_is_of_one_robot(void **state)
+{
+    (void)state;
+    struct fl_block *one = publisher((struct node){"state", "e", "1", "deadline", "0.1"});
+    struct fl_block *two = publisher((struct node){"state", "e", "2", "deadline", "0.1"});
+    struct fl_block *to = subscriber((struct node){"state", "e", "2,1", "deadline", "0.1"});
+    assert_true(reaches(to, "sender", 1, one));
+    assert_true(reaches(to, "sender", 0, two));
+    unsigned good = 0;
+    for (int i = 0; i < 150; i++) {
+        step(two);
+        poll(NULL, 0, PERIOD_MS);
+        step(to);
+        bool in_time = GET(to, "age", double) <= 0.1;
+        assert_int_equal(GET(to, "flag", uint8_t), in_time);
+        good += in_time;
+    }
+    assert_true(good > 0);
+    testbed_end(one);
+    testbed_end(two);
+    testbed_end(to);
+}
+
 static void is_patient_without_a_peer(void **state)
 {
     (void)state;
@@ -308,6 +334,68 @@ static void runs_on_without_dds(void **state)
     testbed_end(from);
     testbed_end(to);
     configure_dds("auto");
+}
+
+/* DDS can be had after the samples waited for it: none of them goes out, and the next ones do. */
+static void what_waited_is_not_sent(void **state)
+{
+    (void)state;
+    setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><General><NoSuchOption/></General></Domain></CycloneDDS>", 1);
+    struct fl_block *from = publisher((struct node){"state", "old", "1", "lifespan", "0.5"});
+    for (int i = 0; i < 10; i++)
+        step(from);
+    poll(NULL, 0, 600);
+    configure_dds("auto");
+    struct fl_block *to = subscriber((struct node){"state", "old", "1", NULL, NULL});
+    SET(from, "withhold", uint8_t, 1);
+    assert_true(reaches(from, "peers", 1, to));
+    poll(NULL, 0, 10 * PERIOD_MS);
+    step(from);
+    assert_int_equal(GET(from, "written", uint32_t), 0);
+    SET(from, "withhold", uint8_t, 0);
+    assert_true(reaches(to, "flag", 1, from));
+    assert_true(GET(to, "number", uint32_t) >= 10);
+    testbed_end(from);
+    testbed_end(to);
+}
+
+/* The lifespan that DDS knows of a topic's writer, in ns; 0: it has not heard of one. */
+static int64_t lifespan_of(dds_entity_t publications, const char *topic)
+{
+    enum { MOST = 16 };
+    void *samples[MOST] = {NULL};
+    dds_sample_info_t infos[MOST];
+    int64_t lifespan = 0;
+    dds_return_t count = dds_read(publications, samples, infos, MOST, MOST);
+    for (dds_return_t i = 0; i < count; i++) {
+        const dds_builtintopic_endpoint_t *writer = samples[i];
+        if (infos[i].valid_data && strcmp(writer->topic_name, topic) == 0)
+            assert_true(dds_qget_lifespan(writer->qos, &lifespan));
+    }
+    dds_return_loan(publications, samples, count);
+    return lifespan;
+}
+
+/* After a link was cut: DDS forgets it, too. */
+static void what_is_old_is_not_sent_again(void **state)
+{
+    (void)state;
+    dds_entity_t participant = dds_create_participant((dds_domainid_t)atoi(domain), NULL, NULL);
+    dds_entity_t publications = dds_create_reader(participant, DDS_BUILTIN_TOPIC_DCPSPUBLICATION, NULL, NULL);
+    assert_true(publications > 0);
+    struct fl_block *from = publisher((struct node){"state", "again", "1", "reliability", "reliable"});
+    struct fl_block *once = publisher((struct node){"state", "once", "1", NULL, NULL});
+    int64_t again = 0, no_more = 0;
+    for (int waited = 0; waited < PATIENCE_MS && !(again && no_more); waited += PERIOD_MS) {
+        poll(NULL, 0, PERIOD_MS);
+        again = lifespan_of(publications, "again");
+        no_more = lifespan_of(publications, "once");
+    }
+    assert_int_equal(again, 100000000);
+    assert_int_equal(no_more, DDS_INFINITY);
+    testbed_end(from);
+    testbed_end(once);
+    dds_delete(participant);
 }
 
 /* --- two processes --- */
@@ -402,8 +490,11 @@ int main(void)
         cmocka_unit_test(takes_no_other_length),
         cmocka_unit_test(qualities_are_asked_for),
         cmocka_unit_test(a_missed_deadline_is_no_good),
+        cmocka_unit_test(a_deadline_is_of_one_robot),
         cmocka_unit_test(is_patient_without_a_peer),
         cmocka_unit_test(runs_on_without_dds),
+        cmocka_unit_test(what_waited_is_not_sent),
+        cmocka_unit_test(what_is_old_is_not_sent_again),
         cmocka_unit_test(the_configuration_is_obeyed),
         cmocka_unit_test(steps_never_block),
     };
