@@ -26,7 +26,7 @@ struct state {
     struct fl_ring samples;
     struct dds_sample arriving, taken; /* DDS's thread's, the step's */
     int arrived_fd;                    /* readable after something was put into the ring */
-    bool open, held;                   /* held: the next step finds its first sample in `taken` */
+    bool open, awaited;                /* awaited: await takes, not the step */
     _Atomic uint32_t peers;
     struct fl_sensor sensor;
 };
@@ -145,31 +145,43 @@ static int start(struct fl_block *block)
     return state->driver ? FL_OK : FL_FAILED;
 }
 
+/* Take the newest sample that waits. When it arrived; 0: none did. */
+static int64_t take(struct fl_block *block)
+{
+    struct state *state = block->state;
+    int64_t taken_ns = 0;
+    for (int i = 0; i < WAITING && fl_ring_take(&state->samples, &state->taken); i++) {
+        memcpy(block->out[VALUES], state->taken.values, dds_value_bytes(&state->settings));
+        FL_OUT(block, NUMBER, uint32_t) = state->taken.number;
+        FL_OUT(block, STAMP, int64_t) = state->taken.stamp_ns;
+        FL_OUT(block, SENDER, uint32_t) = state->taken.sender;
+        fl_sensor_update(&state->sensor, state->taken.arrived_ns, state->sensor.sequence + 1);
+        taken_ns = state->taken.arrived_ns;
+    }
+    return taken_ns;
+}
+
+/* It takes for the step, which could find a newer sample than the one that releases it, and tell that this one came
+ * before it was sent. */
 static int64_t await(struct fl_block *block, int64_t until_ns)
 {
     struct state *state = block->state;
+    int64_t taken_ns;
+    state->awaited = true;
     do {
         eventfd_t count;
         eventfd_read(state->arrived_fd, &count); /* before the look into the ring: what comes after it is not missed */
-        state->held = fl_ring_take(&state->samples, &state->taken);
-        if (state->held)
-            return state->taken.arrived_ns;
-    } while (fl_await_readable(state->arrived_fd, until_ns));
-    return 0;
+        taken_ns = take(block);
+    } while (!taken_ns && fl_await_readable(state->arrived_fd, until_ns));
+    return taken_ns ? taken_ns : take(block); /* a sample may have come while this thread woke up */
 }
 
 static int step(struct fl_block *block)
 {
     const struct dds_subscribe *set = block->parameters;
     struct state *state = block->state;
-    for (int i = 0; i < WAITING && (state->held || fl_ring_take(&state->samples, &state->taken)); i++) {
-        state->held = false;
-        memcpy(block->out[VALUES], state->taken.values, dds_value_bytes(&state->settings));
-        FL_OUT(block, NUMBER, uint32_t) = state->taken.number;
-        FL_OUT(block, STAMP, int64_t) = state->taken.stamp_ns;
-        FL_OUT(block, SENDER, uint32_t) = state->taken.sender;
-        fl_sensor_update(&state->sensor, state->taken.arrived_ns, state->sensor.sequence + 1);
-    }
+    if (!state->awaited)
+        take(block);
     FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
     /* By the age of what was taken: DDS's own status tells of any robot whose samples come by the topic. */
     const double deadline = set->common.deadline;

@@ -33,7 +33,7 @@ struct state {
     struct udp_receiver receiver;
     struct fl_sensor sensor;
     uint8_t *scratch;
-    int64_t arrived_ns; /* of what is in scratch for the next step; 0: nothing is */
+    bool awaited; /* await takes, not the step */
 };
 
 static int configure(struct fl_block *block)
@@ -59,31 +59,41 @@ static int start(struct fl_block *block)
                              udp->failover, (size_t)udp->length);
 }
 
-/* What is not listened to is no reason for a step. */
+/* Take the newest datagram that waits, or the next one. When it arrived; 0: none did. */
+static int64_t take(struct fl_block *block)
+{
+    const struct udp_receive *udp = block->parameters;
+    struct state *state = block->state;
+    int64_t arrived_ns, taken_ns = 0;
+    int budget = UDP_BURST;
+    while (udp_receive(&state->receiver, state->scratch, &arrived_ns, &budget)) {
+        memcpy(block->out[DATA], state->scratch, (size_t)udp->length);
+        fl_sensor_update(&state->sensor, arrived_ns, state->sensor.sequence + 1);
+        taken_ns = arrived_ns;
+        if (udp->take == IN_ORDER)
+            break;
+    }
+    return taken_ns;
+}
+
+/* It takes for the step, which could find a newer datagram than the one that releases it, and tell that this one came
+ * before it was sent. What is not listened to is no reason for a step. */
 static int64_t await(struct fl_block *block, int64_t until_ns)
 {
     struct state *state = block->state;
-    do {
-        int budget = UDP_BURST;
-        if (udp_receive(&state->receiver, state->scratch, &state->arrived_ns, &budget))
-            return state->arrived_ns;
-        state->arrived_ns = 0;
-    } while (fl_await_readable(state->receiver.fd, until_ns));
-    return 0;
+    int64_t taken_ns;
+    state->awaited = true;
+    while (!(taken_ns = take(block)) && fl_await_readable(state->receiver.fd, until_ns))
+        continue;
+    return taken_ns ? taken_ns : take(block); /* a datagram may have come while this thread woke up */
 }
 
 static int step(struct fl_block *block)
 {
     const struct udp_receive *udp = block->parameters;
     struct state *state = block->state;
-    int budget = UDP_BURST;
-    while (state->arrived_ns || udp_receive(&state->receiver, state->scratch, &state->arrived_ns, &budget)) {
-        memcpy(block->out[DATA], state->scratch, (size_t)udp->length);
-        fl_sensor_update(&state->sensor, state->arrived_ns, state->sensor.sequence + 1);
-        state->arrived_ns = 0;
-        if (udp->take == IN_ORDER)
-            break;
-    }
+    if (!state->awaited)
+        take(block);
     fl_sensor_outputs(&state->sensor, block, FLAG, true, udp->timeout);
     udp_receiver_outputs(&state->receiver, block, DROPPED);
     return FL_OK;

@@ -82,6 +82,33 @@ static void takes_newest_or_in_order(void **state)
     takes("in-order", 1, 1);
 }
 
+/* What comes after the release is for the next step: else it would seem to have come before it was sent. */
+static void a_step_has_what_released_it(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = testbed_block("udp-receive", "port", port, "length", "1", NULL);
+    int fd = bare("127.0.0.1", 0);
+    testbed_begin(receive);
+    for (uint8_t i = 1; i <= 2; i++)
+        send_to(fd, port, &i, 1);
+    int64_t sent_ns = fl_now_ns();
+    int64_t released_ns = receive->type->await(receive, INT64_MAX);
+    assert_in_range(released_ns, 1, sent_ns);
+    send_to(fd, port, "\3", 1);
+    step_at(receive, released_ns);
+    assert_int_equal(*(const uint8_t *)testbed_output(receive, "data"), 2);
+    assert_int_equal(arrival_ns(receive), released_ns);
+    assert_true(receive->type->await(receive, 0) > released_ns); /* it is there, however late it is */
+    step_at(receive, fl_now_ns());
+    assert_int_equal(*(const uint8_t *)testbed_output(receive, "data"), 3);
+    assert_int_equal(receive->type->await(receive, 0), 0);
+    step_at(receive, fl_now_ns());
+    assert_int_equal(GET(receive, "sequence", uint32_t), 3);
+    close(fd);
+    testbed_end(receive);
+}
+
 static void refuses_lengths_and_senders(void **state)
 {
     (void)state;
@@ -473,6 +500,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(carries),
         cmocka_unit_test(takes_newest_or_in_order),
+        cmocka_unit_test(a_step_has_what_released_it),
         cmocka_unit_test(refuses_lengths_and_senders),
         cmocka_unit_test(listens_to_the_first_that_speaks),
         cmocka_unit_test(sends_to_several_or_withholds),
