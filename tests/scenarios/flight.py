@@ -99,6 +99,13 @@ class Flight:
         return [seen[number] for number in sorted(seen)]
 
     @cached_property
+    def in_flight(self) -> list[Record]:
+        """Of these, the ones from when the path is flown; all, where none is. Before that programs start, find each
+        other and ask for each other's hardware addresses, and the robot is not moved."""
+        begin = self.commanded[0]["number"] if self.commanded else 0
+        return [step for step in self.arrived if step["number"] >= begin]
+
+    @cached_property
     def commanded(self) -> list[Record]:
         """While the path is flown."""
         return [record for record in self.controls if record["flying"] and not record["done"]]
@@ -126,11 +133,16 @@ class Flight:
 
     def hop(self, index: int) -> Latency:
         """From one task's release to the next one's, in which the former's step lies."""
-        return _latency([step[_STAMPS[index + 1]] - step[_STAMPS[index]] for step in self.arrived])
+        return _latency([step[_STAMPS[index + 1]] - step[_STAMPS[index]] for step in self.in_flight])
 
     def latency(self) -> Latency:
         """From when the sensors' step was due until the valves are switched: four hops."""
-        return _latency([step["now_ns"] + step["offset_ns"] - step["sensed_ns"] for step in self.arrived])
+        return _latency([_four_hops_ns(step) for step in self.in_flight])
+
+    @property
+    def start_up_us(self) -> int:
+        """The longest that four hops took before the path was flown; 0 where there were none."""
+        return max((_four_hops_ns(step) // 1000 for step in self.arrived[: -len(self.in_flight)]), default=0)
 
     def late(self) -> int:
         """Steps whose command arrived, after `LIMIT_US`."""
@@ -155,8 +167,8 @@ class Flight:
         return found
 
     def lost(self) -> int:
-        """Of the robot's steps, from the first whose command arrived to the last: those whose did not."""
-        numbers: list[int] = [step["number"] for step in self.arrived]
+        """Of the robot's steps in flight, from the first whose command arrived to the last: those whose did not."""
+        numbers: list[int] = [step["number"] for step in self.in_flight]
         return numbers[-1] - numbers[0] + 1 - len(numbers)
 
 
@@ -166,6 +178,12 @@ def records(directory: Path, name: str) -> list[Record]:
     if not files:
         raise FileNotFoundError(f"{directory} has no recording {name}")
     return [record for file in files for record in recording.read(file).records]
+
+
+def _four_hops_ns(step: Record) -> int:
+    """From when the sensors' step was due until the valves were switched."""
+    latency_ns: int = step["now_ns"] + step["offset_ns"] - step["sensed_ns"]
+    return latency_ns
 
 
 def _latency(nanoseconds: Sequence[int]) -> Latency:

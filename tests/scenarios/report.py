@@ -101,10 +101,11 @@ def summary(flight: Flight) -> dict[str, object]:
     """The figures of a flight; those of the path only where one was flown."""
     latency = flight.latency()
     found: dict[str, object] = {
-        "steps": len(flight.arrived) + flight.lost(),
+        "steps": len(flight.in_flight) + flight.lost(),
         "lost": flight.lost(),
         "late": flight.late(),
         "latency_us": latency.model_dump(mode="json"),
+        "start_up_us": flight.start_up_us,
     }
     if flight.statistics:
         found["jitter_max_us"] = max(each["jitter"]["max_ns"] for each in flight.statistics.values()) / 1000

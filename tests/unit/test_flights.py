@@ -51,6 +51,15 @@ def test_a_message_cannot_arrive_before_it_was_sent(disturbed: bool) -> None:
     ]
 
 
+def test_steps_count_from_when_the_path_is_flown() -> None:
+    """Seen to fail with all steps that arrived."""
+    found = flight(12_000, 2000, 3000)
+    found.controls = [{"number": 2, "flying": True, "done": False}]
+    assert found.late() == 0
+    assert found.latency().samples == 2
+    assert found.start_up_us == 12_000
+
+
 def test_clocks_of_several_computers_are_not_compared() -> None:
     found = flight(12_000, last_hop_us=-21)
     found.one_clock = False
