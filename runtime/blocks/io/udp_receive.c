@@ -68,7 +68,7 @@ static int64_t await(struct fl_block *block, int64_t until_ns)
         if (udp_receive(&state->receiver, state->scratch, &state->arrived_ns, &budget))
             return state->arrived_ns;
         state->arrived_ns = 0;
-    } while (fl_await_readable(state->receiver.fd, until_ns));
+    } while (fl_await_readable(state->receiver.sockets.fd[0], until_ns));
     return 0;
 }
 
