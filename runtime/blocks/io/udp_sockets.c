@@ -134,7 +134,7 @@ static int watch_interfaces(struct udp_sockets *sockets)
         return fl_fail(sockets->block, "cannot watch network interfaces: %s", strerror(errno));
     sockets->changes_fd = fd;
     if (bind(fd, (const struct sockaddr *)&link, sizeof link) == 0)
-        sockets->driver = fl_driver_start(sockets->block, run, sockets);
+        sockets->driver = fl_driver_start_ordinary(sockets->block, run, sockets);
     else
         fl_fail(sockets->block, "cannot watch network interfaces: %s", strerror(errno));
     if (sockets->driver)
