@@ -293,6 +293,22 @@ def test_overruns_are_left_out_or_caught_up_with(tasks: Tasks) -> None:
     assert catching_up["skipped"] == 0
 
 
+def test_what_integrates_goes_by_time_where_steps_are_left_out(tasks: Tasks) -> None:
+    """However slow the host: what lies between two steps of a block counts, up to ten of its periods."""
+    blocks = """one: {type: constant, parameters: {value: 1}}
+often: {type: integrator, in: {in: one.out}}
+rare: {type: integrator, every: 3, in: {in: one.out}}
+bad: {type: misbehave, parameters: {manner: late, from: 2, late_s: 0.025}}"""
+    ended = tasks.run(task(blocks, "period: 10 ms\noverruns: 0"), "--steps", "40", "--watch", "often.out,rare.out")
+    assert ended.statistics["skipped"] >= 70
+    for name, every in (("often.out", 1), ("rare.out", 3)):
+        turns = ended.rows[::every]
+        passed = [after["release_ns"] - row["release_ns"] for row, after in itertools.pairwise(turns)]
+        expected = list(itertools.accumulate((min(ns, every * 100_000_000) / 1e9 for ns in passed), initial=0.0))
+        assert [row[name] for row in turns] == pytest.approx(expected, abs=1e-9)
+        assert expected[-1] > 2 * 0.01 * every * len(passed)
+
+
 @pytest.fixture
 def running(tasks: Tasks, tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
     """Start a task and wait for its first step."""
@@ -368,7 +384,7 @@ def test_a_plugin_of_another_interface_is_refused(tasks: Tasks, tmp_path: Path) 
     compile_shared(PLUGIN / "misbehave.c", tmp_path / "old.so", f"-I{HEADERS}", "-DMISBEHAVE_ABI=999")
     older = Tasks(tasks.program, tmp_path, tmp_path)
     lines = older.refusal(task("a: {type: misbehave, parameters: {manner: fail}}"))
-    assert "made for interface 999 of blocks, this is 2; build it anew" in lines[0]
+    assert "made for interface 999 of blocks, this is 3; build it anew" in lines[0]
     assert "there is no block misbehave" in lines[-1]
 
 

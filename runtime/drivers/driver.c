@@ -26,8 +26,8 @@ static void *enter(void *argument)
     return NULL;
 }
 
-struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
-                                  void *context)
+static struct fl_driver *start(struct fl_block *block, struct fl_service *service,
+                               void (*run)(struct fl_driver *driver, void *context), void *context)
 {
     struct fl_driver *driver = fl_allocate(block, sizeof *driver);
     if (!driver)
@@ -39,13 +39,26 @@ struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_
         fl_fail(block, "eventfd: %s", strerror(errno));
         return NULL;
     }
-    int error = fl_service_thread(block->service, &driver->thread, block->name, enter, driver);
+    int error = fl_service_thread(service, &driver->thread, block->name, enter, driver);
     if (error) {
         close(driver->stop_fd);
         fl_fail(block, "cannot start the driver's thread: %s", strerror(error));
         return NULL;
     }
     return driver;
+}
+
+struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
+                                  void *context)
+{
+    return start(block, block->service, run, context);
+}
+
+struct fl_driver *fl_driver_start_ordinary(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
+                                           void *context)
+{
+    struct fl_service ordinary = {0};
+    return start(block, &ordinary, run, context);
 }
 
 void fl_driver_stop(struct fl_driver *driver)

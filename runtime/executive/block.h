@@ -30,6 +30,16 @@ int block_make_signals(struct fl_block *block);
 /* Let an input read what `signal` points at. */
 void block_wire(struct fl_block *block, uint32_t port, const void *signal);
 
+/* A step of it begins, that was due at `release_ns`. */
+static inline void block_release(struct fl_block *block, int64_t release_ns)
+{
+    const int64_t longest_ns = FL_LONGEST_INTERVAL * block->period_ns;
+    int64_t interval_ns = block->step ? release_ns - block->release_ns : block->period_ns;
+    interval_ns = interval_ns < longest_ns ? interval_ns : longest_ns;
+    block->interval_ns = interval_ns > 0 ? interval_ns : 0;
+    block->release_ns = release_ns;
+}
+
 /* Bring what a step of it touches to the cache. NULL is allowed. */
 static inline void block_prefetch(const struct fl_block *block)
 {

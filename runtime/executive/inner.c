@@ -297,7 +297,7 @@ void fl_inner_step(struct fl_inner *inner, const void *const *in, void *const *o
     struct fl_block *block = inner->block;
     for (uint32_t i = 0; i < block->in_count; i++)
         block_wire(block, i, in[i]);
-    block->release_ns = inner->outer->release_ns;
+    block_release(block, inner->outer->release_ns);
     if (block->type->step(block) != FL_OK)
         fail(inner, block->type->name, block->service->failure);
     block->step++;

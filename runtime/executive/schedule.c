@@ -82,7 +82,7 @@ const struct fl_block *schedule_step(struct schedule *schedule, int64_t release_
         for (; call < end; call++) {
             struct fl_block *block = call->block;
             block_prefetch(call[AHEAD].block);
-            block->release_ns = release_ns;
+            block_release(block, release_ns);
             int failed = call->step(block);
             block->step++;
             int64_t after = ticks_now(counter), took = after - before;

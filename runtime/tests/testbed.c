@@ -97,7 +97,12 @@ void testbed_begin(struct fl_block *block)
 
 int testbed_step(struct fl_block *block)
 {
-    block->release_ns += block->period_ns;
+    return testbed_step_after(block, block->period_ns);
+}
+
+int testbed_step_after(struct fl_block *block, int64_t interval_ns)
+{
+    block_release(block, block->release_ns + interval_ns);
     int result = block->type->step(block);
     block->step++;
     return result;

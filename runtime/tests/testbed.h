@@ -25,6 +25,9 @@ void testbed_begin(struct fl_block *block);
 /* One step, at release_ns one period later than the last. Its result. */
 int testbed_step(struct fl_block *block);
 
+/* The same, so much later than the last. */
+int testbed_step_after(struct fl_block *block, int64_t interval_ns);
+
 /* Where the test writes an input (an array of the port's type), and reads an output. By name. */
 void *testbed_input(struct fl_block *block, const char *port);
 const void *testbed_output(struct fl_block *block, const char *port);

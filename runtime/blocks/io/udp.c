@@ -3,16 +3,13 @@
 
 #include <arpa/inet.h>
 #include <errno.h>
-#include <inttypes.h>
 #include <linux/filter.h>
 #include <linux/sock_diag.h>
 #include <linux/time_types.h>
-#include <net/if.h>
 #include <string.h>
 #include <sys/socket.h>
 #include <sys/uio.h>
 #include <time.h>
-#include <unistd.h>
 
 int udp_read_address(struct fl_block *block, const char *parameter, const char *text, struct in_addr *address)
 {
@@ -35,17 +32,6 @@ int udp_read_addresses(struct fl_block *block, const char *parameter, struct fl_
             return fl_fail(block, "parameter %s: 0.0.0.0 is anybody, and cannot be one of several", parameter);
     }
     return FL_OK;
-}
-
-static int fail_to_bind(struct fl_block *block, const char *local_address, int64_t port)
-{
-    if (errno == EADDRINUSE)
-        return fl_fail(block, "UDP port %" PRId64 " is taken: another block or program receives there", port);
-    if (errno == EADDRNOTAVAIL)
-        return fl_fail(block, "%s is no address of this computer", local_address);
-    if (errno == EACCES)
-        return fl_fail(block, "UDP port %" PRId64 " needs CAP_NET_BIND_SERVICE; take one from 1024 on", port);
-    return fl_fail(block, "cannot bind UDP port %" PRId64 ": %s", port, strerror(errno));
 }
 
 /* What passes a receiver: datagrams of its length, from one of its senders. Run by the kernel before a datagram joins
@@ -78,44 +64,15 @@ static struct filter filter_of(const struct in_addr *from, size_t count, size_t 
     return filter;
 }
 
-/* `receiver`: NULL where the socket only sends. */
-static bool set_up(int fd, const struct udp_receiver *receiver)
+static bool prepare(int fd, const void *context)
 {
     static const int on = 1;
-    if (!receiver)
-        return true;
+    const struct udp_receiver *receiver = context;
     struct filter filter = filter_of(receiver->from, receiver->from_count, receiver->length);
     const struct sock_fprog program = {filter.count, filter.code};
     /* The new time stamp has 64 bits on i386 too. */
     return setsockopt(fd, SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program) == 0 &&
            setsockopt(fd, SOL_SOCKET, SO_TIMESTAMPNS_NEW, &on, sizeof on) == 0;
-}
-
-int udp_open(struct fl_block *block, const char *local_address, int64_t port, const char *interface,
-             const struct udp_receiver *receiver)
-{
-    struct sockaddr_in local = {.sin_family = AF_INET, .sin_port = htons((uint16_t)port)};
-    if (udp_read_address(block, "local_address", local_address, &local.sin_addr) != FL_OK)
-        return -1;
-    if (strlen(interface) >= IFNAMSIZ || (*interface && !if_nametoindex(interface))) {
-        fl_fail(block, "there is no network interface %s", interface);
-        return -1;
-    }
-    int fd = socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-    if (fd < 0) {
-        fl_fail(block, "cannot open a UDP socket: %s", strerror(errno));
-        return -1;
-    }
-    if (*interface && setsockopt(fd, SOL_SOCKET, SO_BINDTODEVICE, interface, (socklen_t)strlen(interface)) < 0)
-        fl_fail(block, "cannot bind to network interface %s: %s", interface, strerror(errno));
-    else if (!set_up(fd, receiver)) /* before it has a port: nothing comes past the filter */
-        fl_fail(block, "cannot set up the UDP socket: %s", strerror(errno));
-    else if (bind(fd, (struct sockaddr *)&local, sizeof local) < 0)
-        fail_to_bind(block, local_address, port);
-    else
-        return fd;
-    close(fd);
-    return -1;
 }
 
 int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_texts from)
@@ -129,14 +86,17 @@ int udp_receiver_check(struct fl_block *block, const char *local_address, struct
 int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
                       const char *interface, struct fl_texts from, double failover, size_t length)
 {
-    *receiver = (struct udp_receiver){
-        .emptied_ns = fl_now_ns(), .from_count = from.count, .failover_timeout = failover, .length = length};
+    struct in_addr local;
+    *receiver = (struct udp_receiver){.sockets = {.prepare = prepare, .context = receiver},
+                                      .emptied_ns = fl_now_ns(),
+                                      .from_count = from.count,
+                                      .failover_timeout = failover,
+                                      .length = length};
     fl_failover_begin(&receiver->failover, receiver->emptied_ns);
-    if (udp_read_addresses(block, "from", from, receiver->from) != FL_OK)
+    if (udp_read_addresses(block, "from", from, receiver->from) != FL_OK ||
+        udp_read_address(block, "local_address", local_address, &local) != FL_OK)
         return FL_FAILED;
-    receiver->fd = udp_open(block, local_address, port, interface, receiver);
-    receiver->open = receiver->fd >= 0;
-    return receiver->open ? FL_OK : FL_FAILED;
+    return udp_sockets_open(&receiver->sockets, block, 1, local, port, interface);
 }
 
 int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns)
@@ -173,8 +133,10 @@ static void count_lost(struct udp_receiver *receiver)
     enum { DATAGRAM = 4096 }; /* memory that the kernel charges for one, at most */
     uint32_t now[SK_MEMINFO_VARS] = {0};
     socklen_t size = sizeof now;
-    if (getsockopt(receiver->fd, SOL_SOCKET, SO_MEMINFO, now, &size) < 0)
+    if (getsockopt(receiver->sockets.fd[0], SOL_SOCKET, SO_MEMINFO, now, &size) < 0)
         return;
+    if (now[SK_MEMINFO_DROPS] < receiver->lost)
+        receiver->lost = 0; /* a new socket */
     bool full = now[SK_MEMINFO_RMEM_ALLOC] + DATAGRAM > now[SK_MEMINFO_RCVBUF];
     *(full ? &receiver->dropped : &receiver->refused) += now[SK_MEMINFO_DROPS] - receiver->lost;
     receiver->lost = now[SK_MEMINFO_DROPS];
@@ -204,7 +166,7 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
                                  .msg_control = control,
                                  .msg_controllen = sizeof control};
         int64_t before_ns = fl_now_ns();
-        ssize_t got = recvmsg(receiver->fd, &message, MSG_DONTWAIT);
+        ssize_t got = recvmsg(receiver->sockets.fd[0], &message, MSG_DONTWAIT);
         if (got < 0 && errno == EAGAIN)
             receiver->emptied_ns = before_ns;
         if (got < 0)
@@ -233,7 +195,5 @@ void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *
 
 void udp_receiver_close(struct udp_receiver *receiver)
 {
-    if (receiver->open)
-        close(receiver->fd);
-    receiver->open = false;
+    udp_sockets_close(&receiver->sockets);
 }

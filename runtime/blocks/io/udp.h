@@ -1,9 +1,8 @@
-/* UDP sockets over IPv4 for blocks: opened at start, and never waited for. */
+/* UDP over IPv4 for blocks: what their parameters say, and receiving, which never waits. */
 #ifndef FLOTILLA_IO_UDP_H
 #define FLOTILLA_IO_UDP_H
 
-#include <flotilla/failover.h>
-#include <netinet/in.h>
+#include "udp_sockets.h"
 
 enum {
     /* What fits one Ethernet or 802.11 frame: a datagram in fragments is lost with any of them. */
@@ -19,9 +18,10 @@ enum {
 
 #define UDP_LOCAL_PARAMETERS(type)                                                                                     \
     FL_PARAMETER(type, local_address, .fallback = "0.0.0.0",                                                           \
-                 .summary = "IPv4 address of this computer; 0.0.0.0: any"),                                            \
+                 .summary = "IPv4 address of this computer, which may come later; 0.0.0.0: any"),                      \
         FL_PARAMETER(type, interface, .fallback = "",                                                                  \
-                     .summary = "network interface that datagrams have to pass, such as wlan0; empty: any")
+                     .summary = "network interface that datagrams have to pass, such as wlan0, which may come later; " \
+                                "empty: any")
 
 /* What a block that receives has besides. */
 #define UDP_RECEIVER_MEMBERS                                                                                           \
@@ -44,18 +44,10 @@ int udp_read_address(struct fl_block *block, const char *parameter, const char *
 /* The same for a list of 1 to FL_SENDERS addresses, in which 0.0.0.0 stands alone. */
 int udp_read_addresses(struct fl_block *block, const char *parameter, struct fl_texts texts, struct in_addr *addresses);
 
-struct udp_receiver;
-
-/* A socket bound to this computer's address, a port (0: any free one) and an interface: descriptor, or -1 after
- * fl_fail(). With a receiver, datagrams of its length and senders alone come in; with NULL the socket is to send. */
-int udp_open(struct fl_block *block, const char *local_address, int64_t port, const char *interface,
-             const struct udp_receiver *receiver);
-
 /* --- receiving --- */
 
 struct udp_receiver {
-    bool open;
-    int fd;
+    struct udp_sockets sockets; /* one */
     struct in_addr from[FL_SENDERS];
     size_t from_count;
     size_t length;   /* bytes of a datagram */

@@ -83,7 +83,7 @@ static int64_t await(struct fl_block *block, int64_t until_ns)
     struct state *state = block->state;
     int64_t taken_ns;
     state->awaited = true;
-    while (!(taken_ns = take(block)) && fl_await_readable(state->receiver.fd, until_ns))
+    while (!(taken_ns = take(block)) && fl_await_readable(state->receiver.sockets.fd[0], until_ns))
         continue;
     return taken_ns ? taken_ns : take(block); /* a datagram may have come while this thread woke up */
 }

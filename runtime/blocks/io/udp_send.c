@@ -41,7 +41,7 @@ static const struct fl_port outputs[] = {
     {.name = "failed",
      .type = FL_UINT32,
      .width = 1,
-     .summary = "datagrams the network did not take: no route, or full"},
+     .summary = "datagrams the network did not take: not there, no route, or full"},
 };
 
 enum { WITHHOLD, SEQUENCE, DATA };
@@ -49,9 +49,8 @@ enum { SENT, FAILED };
 
 /* A socket each: what waits for the hardware address of a computer that is gone fills its socket. */
 struct state {
-    size_t open;
+    struct udp_sockets sockets;
     uint32_t sequence; /* in the step before; 0: nothing has come yet, or nothing is wired */
-    int fd[FL_SENDERS];
     struct sockaddr_in to[FL_SENDERS];
 };
 
@@ -89,13 +88,21 @@ static int refuse_broadcast(struct fl_block *block, const struct sockaddr_in *to
     return FL_OK;
 }
 
+static bool prepare(int fd, const void *context)
+{
+    const struct udp_send *udp = context;
+    int on = udp->broadcast, service = (int)udp->dscp << 2; /* above the two bits of congestion notification */
+    return setsockopt(fd, SOL_SOCKET, SO_BROADCAST, &on, sizeof on) == 0 &&
+           setsockopt(fd, IPPROTO_IP, IP_TOS, &service, sizeof service) == 0;
+}
+
 static int start(struct fl_block *block)
 {
     const struct udp_send *udp = block->parameters;
     struct state *state = block->state;
-    int on = udp->broadcast, service = (int)udp->dscp << 2; /* above the two bits of congestion notification */
-    struct in_addr to[FL_SENDERS];
-    if (udp_read_addresses(block, "address", udp->address, to) != FL_OK)
+    struct in_addr to[FL_SENDERS], local;
+    if (udp_read_addresses(block, "address", udp->address, to) != FL_OK ||
+        udp_read_address(block, "local_address", udp->local_address, &local) != FL_OK)
         return FL_FAILED;
     for (size_t i = 0; i < udp->address.count; i++) {
         state->to[i] =
@@ -103,16 +110,9 @@ static int start(struct fl_block *block)
         if (!udp->broadcast && refuse_broadcast(block, &state->to[i], udp->address.value[i]) != FL_OK)
             return FL_FAILED;
     }
-    for (size_t i = 0; i < udp->address.count; i++) {
-        state->fd[i] = udp_open(block, udp->local_address, 0, udp->interface, NULL);
-        if (state->fd[i] < 0)
-            return FL_FAILED;
-        state->open++;
-        if (setsockopt(state->fd[i], SOL_SOCKET, SO_BROADCAST, &on, sizeof on) < 0 ||
-            setsockopt(state->fd[i], IPPROTO_IP, IP_TOS, &service, sizeof service) < 0)
-            return fl_fail(block, "cannot set up the UDP socket: %s", strerror(errno));
-    }
-    return FL_OK;
+    state->sockets.prepare = prepare;
+    state->sockets.context = udp;
+    return udp_sockets_open(&state->sockets, block, udp->address.count, local, 0, udp->interface);
 }
 
 static int step(struct fl_block *block)
@@ -124,7 +124,7 @@ static int step(struct fl_block *block)
     if (FL_IN(block, WITHHOLD, uint8_t) || (before && before == state->sequence))
         return FL_OK;
     for (size_t i = 0; i < udp->address.count; i++) {
-        ssize_t sent = sendto(state->fd[i], block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
+        ssize_t sent = sendto(state->sockets.fd[i], block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
                               (const struct sockaddr *)&state->to[i], sizeof state->to[i]);
         if (sent == udp->length)
             FL_OUT(block, SENT, uint32_t)++;
@@ -137,8 +137,7 @@ static int step(struct fl_block *block)
 static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
-    while (state->open)
-        close(state->fd[--state->open]);
+    udp_sockets_close(&state->sockets);
 }
 
 FL_BLOCK(udp_send) = {

@@ -11,8 +11,8 @@ struct alpha_beta_filter {
 
 struct state {
     bool begun;
-    uint32_t sequence;      /* of the last measurement taken */
-    int64_t corrected_step; /* of the block, when that was */
+    uint32_t sequence; /* of the last measurement taken */
+    int64_t since_ns;  /* it was taken, in time of the block's steps */
 };
 
 static const struct fl_parameter parameters[] = {
@@ -60,7 +60,7 @@ static int initialize(struct fl_block *block)
 {
     struct state *state = block->state;
     const struct alpha_beta_filter *set = block->parameters;
-    *state = (struct state){.corrected_step = -1};
+    *state = (struct state){0};
     for (int64_t i = 0; i < set->width; i++)
         ((double *)block->out[VALUE])[i] = ((double *)block->out[RATE])[i] = 0;
     return FL_OK;
@@ -84,16 +84,17 @@ static int step(struct fl_block *block)
     struct state *state = block->state;
     const double *measurement = block->in[MEASUREMENT], *acceleration = block->in[ACCELERATION];
     double *value = block->out[VALUE], *rate = block->out[RATE];
-    const double period = 1e-9 * (double)block->period_ns;
+    const double step_s = fl_interval_s(block);
+    state->since_ns += block->interval_ns;
     for (int64_t i = 0; i < set->width; i++) {
-        double change = isfinite(acceleration[i]) ? acceleration[i] * period : 0;
-        value[i] += (rate[i] + change / 2) * period;
+        double change = isfinite(acceleration[i]) ? acceleration[i] * step_s : 0;
+        value[i] += (rate[i] + change / 2) * step_s;
         rate[i] += change;
     }
-    if (!measured(block, state))
+    if (!measured(block, state) || !state->since_ns)
         return FL_OK;
     /* Critically damped: the gains of a line fitted by least squares to all measurements, older ones counting less. */
-    double interval = period * (double)((int64_t)block->step - state->corrected_step);
+    double interval = 1e-9 * (double)block->period_ns * ((double)state->since_ns / (double)block->period_ns);
     double fade = exp(-interval / set->time_constant);
     double alpha = state->begun ? 1 - fade * fade : 1;
     double beta = state->begun ? (1 - fade) * (1 - fade) : 0;
@@ -104,7 +105,7 @@ static int step(struct fl_block *block)
     }
     state->begun = true;
     state->sequence = FL_IN(block, SEQUENCE, uint32_t);
-    state->corrected_step = (int64_t)block->step;
+    state->since_ns = 0;
     return FL_OK;
 }
 

@@ -127,7 +127,7 @@ static int initialize_integrator(struct fl_block *block)
 
 static int step_integrator(struct fl_block *block)
 {
-    double grown = FL_OUT(block, 0, double) + 1e-9 * (double)block->period_ns * FL_IN(block, 0, double);
+    double grown = FL_OUT(block, 0, double) + fl_interval_s(block) * FL_IN(block, 0, double);
     if (FL_IN(block, 1, uint8_t))
         return initialize_integrator(block);
     if (block->step && isfinite(grown))

@@ -102,13 +102,13 @@ static int step_odometry(struct fl_block *block)
     const struct odometry *odometry = block->parameters;
     double left = FL_IN(block, LEFT, double), right = FL_IN(block, RIGHT, double);
     double v = odometry->radius * (right + left) / 2, omega = odometry->radius * (right - left) / odometry->track;
-    double h = 1e-9 * (double)block->period_ns;
+    double h = fl_interval_s(block);
     if (FL_IN(block, RESET, uint8_t))
         return initialize_odometry(block);
     if (!isfinite(v) || !isfinite(omega))
         v = omega = 0;
     /* An arc's chord is its length times sin(a)/a of half its angle, and points halfway between the two headings:
-     * exact while the wheels' speeds are constant during a period. */
+     * exact while the wheels' speeds are constant between two steps. */
     double half = omega * h / 2, chord = v * h * (half < -1e-8 || half > 1e-8 ? sin(half) / half : 1);
     double middle = FL_OUT(block, HEADING, double) + half;
     FL_OUT(block, V, double) = v;

@@ -45,7 +45,7 @@ static int step(struct fl_block *block)
 {
     const struct limit *limit = block->parameters;
     double in = FL_IN(block, 0, double), before = FL_OUT(block, 0, double);
-    double change = limit->rate > 0 ? limit->rate * 1e-9 * (double)block->period_ns : INFINITY;
+    double change = limit->rate > 0 ? limit->rate * 1e-9 * (double)block->interval_ns : INFINITY;
     /* The range wins over the rate: it may have been tuned to end below where the output is. */
     double out = isnan(in) ? before : clamped(limit, fmin(fmax(in, before - change), before + change));
     FL_OUT(block, 0, double) = out;

@@ -37,7 +37,7 @@ static int step(struct fl_block *block)
     /* One value that is not finite would stay in the filter for ever. */
     if (!isfinite(in))
         return FL_OK;
-    double rest = low_pass->time_constant > 0 ? exp(-1e-9 * (double)block->period_ns / low_pass->time_constant) : 0;
+    double rest = low_pass->time_constant > 0 ? exp(-fl_interval_s(block) / low_pass->time_constant) : 0;
     state->value = state->begun ? in + (state->value - in) * rest : in;
     state->begun = true;
     FL_OUT(block, 0, double) = state->value;
@@ -47,7 +47,7 @@ static int step(struct fl_block *block)
 FL_BLOCK(low_pass) = {
     .abi = FL_ABI,
     .name = "low-pass",
-    .summary = "smooths a signal: first-order low-pass filter, exact for an input that is constant during a period",
+    .summary = "smooths a signal: first-order low-pass filter, exact for an input that is constant between two steps",
     .source = "zero-order-hold equivalent of 1/(Ts + 1): Åström, Wittenmark, Computer-Controlled Systems, section 2.3",
     FL_TABLE(input, inputs),
     FL_TABLE(output, outputs),

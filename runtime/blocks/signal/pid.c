@@ -15,7 +15,8 @@ struct pid {
 struct state {
     double integral;    /* part of the output */
     double derivative;  /* of the measurement, filtered */
-    double measurement; /* of the step before */
+    double measurement; /* that the derivative is of */
+    int64_t since_ns;   /* that was, in time of the block's steps */
     bool begun;         /* there was a step before */
 };
 
@@ -108,17 +109,30 @@ static void integrate(const struct pid *pid, struct state *state, double h, doub
         state->integral += growth;
 }
 
+/* Two steps that a trigger brought close to each other would divide by next to nothing: the second is left out. */
+static void differentiate(const struct fl_block *block, double measurement)
+{
+    const struct pid *pid = block->parameters;
+    struct state *state = block->state;
+    state->since_ns += block->interval_ns;
+    if (state->begun && 2 * state->since_ns < block->period_ns)
+        return;
+    double change = difference(pid, measurement, state->measurement);
+    state->derivative =
+        state->begun ? (pid->filter * state->derivative + change) / (pid->filter + 1e-9 * (double)state->since_ns) : 0;
+    state->measurement = measurement;
+    state->since_ns = 0;
+}
+
 static int step(struct fl_block *block)
 {
     const struct pid *pid = block->parameters;
     struct state *state = block->state;
-    double h = 1e-9 * (double)block->period_ns, measurement = FL_IN(block, MEASUREMENT, double);
+    double h = fl_interval_s(block), measurement = FL_IN(block, MEASUREMENT, double);
     double error = difference(pid, FL_IN(block, SET_POINT, double), measurement);
     if (FL_IN(block, RESET, uint8_t))
         return initialize(block);
-    double change = difference(pid, measurement, state->measurement);
-    state->derivative = state->begun ? (pid->filter * state->derivative + change) / (pid->filter + h) : 0;
-    state->measurement = measurement;
+    differentiate(block, measurement);
     double wanted =
         pid->kp * error + state->integral - pid->kd * state->derivative + FL_IN(block, FEED_FORWARD, double);
     state->begun = isfinite(wanted) && isfinite(state->derivative); /* otherwise the derivative begins anew */

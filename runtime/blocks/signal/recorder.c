@@ -44,6 +44,10 @@ enum {
     FILE_BYTES = NAME_BYTES + 16,
 };
 
+/* Two seconds of buffer by default: a card may be busy with a write for half a second (SD Physical Layer Specification,
+ * 4.6.2.2), a sync writes more than once, and at its ordinary priority the writer has its turn after all that is
+ * urgent.
+ */
 struct recorder {
     LAYOUT_MEMBERS;
     const char *directory, *name;
@@ -88,7 +92,7 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct recorder, files, .fallback = "8", .min = 1, .max = MOST_FILES,
                  .summary = "that are kept, those of earlier runs included: the oldest goes when a new one is begun"),
     FL_PARAMETER(struct recorder, buffer, .fallback = "2", .min = 0.2, .max = 600, .unit = "s",
-                 .summary = "of records that wait in memory while the disk is busy"),
+                 .summary = "of records that wait in memory while the disk or the processor is busy"),
     FL_PARAMETER(struct recorder, sync, .fallback = "5", .min = 0, .max = 3600, .unit = "s",
                  .summary = "how much is lost at most when power goes; 0: as much as the system holds back"),
 };
@@ -436,7 +440,8 @@ static int start(struct fl_block *block)
     if (find_files(block, state) != FL_OK)
         return FL_FAILED;
     atomic_store(&state->recording, true);
-    state->driver = fl_driver_start(block, run, state);
+    /* The kernel's disk work in a write or a sync takes milliseconds: nothing of the robot may wait for it. */
+    state->driver = fl_driver_start_ordinary(block, run, state);
     return state->driver ? FL_OK : FL_FAILED;
 }
 

@@ -22,7 +22,7 @@
 #include <stdint.h>
 
 /* Changes whenever a structure of this header does. A plug-in of another version is refused. */
-#define FL_ABI 2u
+#define FL_ABI 3u
 
 enum { FL_OK = 0, FL_FAILED = -1 };
 
@@ -146,8 +146,21 @@ struct fl_block {
     int64_t release_ns; /* when this step was due, CLOCK_MONOTONIC; the same for all blocks of a step */
     uint64_t step;      /* steps of this block before this one */
 
+    /* From the release of this block's step before to this one's: what a step integrates over. It is exactly period_ns
+     * while no step was left out or triggered off time, and in the first step; never negative, and FL_LONGEST_INTERVAL
+     * periods at most, so that what was stopped for long goes on without a jump. */
+    int64_t interval_ns;
+
     struct fl_service *service;
 };
+
+enum { FL_LONGEST_INTERVAL = 10 }; /* periods */
+
+/* The interval in seconds. */
+static inline double fl_interval_s(const struct fl_block *block)
+{
+    return 1e-9 * (double)block->interval_ns;
+}
 
 /* The one value of a scalar port. */
 #define FL_IN(block, port, c_type)  (*(const c_type *)(block)->in[port])

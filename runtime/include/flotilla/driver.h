@@ -19,6 +19,11 @@ struct fl_driver;
 struct fl_driver *fl_driver_start(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
                                   void *context);
 
+/* The same at ordinary priority, whatever the task's: for what writes files, or is in no hurry. Above the interrupts'
+ * threads it would hold up serial ports, CAN and the network. */
+struct fl_driver *fl_driver_start_ordinary(struct fl_block *block, void (*run)(struct fl_driver *driver, void *context),
+                                           void *context);
+
 /* Ask the thread to return and wait for it. NULL is allowed. */
 void fl_driver_stop(struct fl_driver *driver);
 

@@ -479,13 +479,9 @@ static void refuses_to_start_without(void **state)
 {
     (void)state;
     const char *port = free_port();
-    refuses_to_start(testbed_block("udp-receive", "port", port, "length", "1", "interface", "nosuch0", NULL),
-                     "there is no network interface nosuch0");
     refuses_to_start(
         testbed_block("udp-receive", "port", port, "length", "1", "interface", "a-name-that-is-too-long", NULL),
-        "there is no network interface a-name-that-is-too-long");
-    refuses_to_start(testbed_block("udp-receive", "port", port, "length", "1", "local_address", "192.0.2.1", NULL),
-                     "192.0.2.1 is no address of this computer");
+        "interface: a-name-that-is-too-long is longer than the 15 characters of a name");
     struct fl_block *first = testbed_block("udp-receive", "port", port, "length", "1", NULL);
     testbed_begin(first);
     refuses_to_start(testbed_block("udp-receive", "port", port, "length", "1", NULL), "another block or program");

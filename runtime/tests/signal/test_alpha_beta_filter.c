@@ -86,6 +86,26 @@ static void follows_a_known_acceleration(void **state)
     testbed_end(filter);
 }
 
+/* Steps of 10, 35 and 0 ms, and a measurement in every other one. */
+static void follows_in_late_steps(void **state)
+{
+    (void)state;
+    static const int64_t intervals_ns[] = {10000000, 35000000, 0, 5000000, 80000000};
+    struct fl_block *filter = testbed_block("alpha-beta-filter", "time_constant", "0.1", NULL);
+    double time = 0;
+    testbed_begin(filter);
+    for (uint32_t i = 0; i < 1000; i++) {
+        int64_t interval_ns = intervals_ns[i % 5];
+        time += i ? 1e-9 * (double)interval_ns : 0;
+        SET(filter, "measurement", double, 2 * time);
+        SET(filter, "sequence", uint32_t, 1 + i / 2);
+        assert_int_equal(testbed_step_after(filter, interval_ns), FL_OK);
+    }
+    assert_near(GET(filter, "rate", double), 2, 1e-9);
+    assert_near(GET(filter, "value", double), 2 * time, 1e-9);
+    testbed_end(filter);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -94,6 +114,7 @@ int main(void)
         cmocka_unit_test(follows_a_constant_rate),
         cmocka_unit_test(goes_on_by_itself_without_measurements),
         cmocka_unit_test(follows_a_known_acceleration),
+        cmocka_unit_test(follows_in_late_steps),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -103,13 +103,34 @@ static void integrates(void **state)
     testbed_end(other);
 }
 
+/* Also where steps come late, early or at once; after a long stop it goes on with ten periods. */
+static void integrates_time(void **state)
+{
+    (void)state;
+    static const struct {
+        int64_t interval_ns;
+        double grown;
+    } steps[] = {{10000000, 0.01}, {35000000, 0.035}, {2500000, 0.0025}, {0, 0},
+                 {-1000, 0},       {100000000, 0.1},  {100000001, 0.1},  {INT64_C(3600000000000), 0.1}};
+    struct fl_block *integrator = testbed_block("integrator", NULL);
+    double expected = 0;
+    testbed_begin(integrator);
+    SET(integrator, "in", double, 1);
+    testbed_step_after(integrator, INT64_C(3600000000000)); /* nothing came before the first */
+    assert_near(GET(integrator, "out", double), 0, 0);
+    for (size_t i = 0; i < sizeof steps / sizeof steps[0]; i++) {
+        testbed_step_after(integrator, steps[i].interval_ns);
+        expected += steps[i].grown;
+        assert_near(GET(integrator, "out", double), expected, 1e-12);
+    }
+    testbed_end(integrator);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(delays_by_a_step),
-        cmocka_unit_test(begins_with_any_type),
-        cmocka_unit_test(refuses),
-        cmocka_unit_test(integrates),
+        cmocka_unit_test(delays_by_a_step), cmocka_unit_test(begins_with_any_type), cmocka_unit_test(refuses),
+        cmocka_unit_test(integrates),       cmocka_unit_test(integrates_time),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -98,6 +98,25 @@ static void keeps_its_pose(void **state)
     testbed_end(odometry);
 }
 
+/* A full turn takes 4 pi s, in whatever steps. */
+static void keeps_its_pose_in_late_steps(void **state)
+{
+    (void)state;
+    struct fl_block *odometry = testbed_block("differential-odometry", "radius", "0.1", "track", "0.4", NULL);
+    const int64_t turn_ns = llround(4e9 * pi);
+    testbed_begin(odometry);
+    roll(odometry, 2, 4, 1);
+    for (int64_t time_ns = 10000000, next_ns = 35000000; time_ns < turn_ns; time_ns += next_ns) {
+        if (next_ns > turn_ns - time_ns)
+            next_ns = turn_ns - time_ns;
+        assert_int_equal(testbed_step_after(odometry, next_ns), FL_OK);
+    }
+    assert_near(GET(odometry, "heading", double), 2 * pi, 1e-8);
+    assert_near(GET(odometry, "x", double), 0, 1e-8);
+    assert_near(GET(odometry, "y", double), 0, 1e-8);
+    testbed_end(odometry);
+}
+
 static void refuses(void **state)
 {
     (void)state;
@@ -108,8 +127,11 @@ static void refuses(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(turns_the_wheels), cmocka_unit_test(slows_down_on_the_curve),
-        cmocka_unit_test(drives_a_circle),  cmocka_unit_test(keeps_its_pose),
+        cmocka_unit_test(turns_the_wheels),
+        cmocka_unit_test(slows_down_on_the_curve),
+        cmocka_unit_test(drives_a_circle),
+        cmocka_unit_test(keeps_its_pose),
+        cmocka_unit_test(keeps_its_pose_in_late_steps),
         cmocka_unit_test(refuses),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

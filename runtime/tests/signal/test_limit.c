@@ -57,6 +57,19 @@ static void keeps_the_rate(void **state)
     testbed_end(other);
 }
 
+static void keeps_the_rate_in_late_steps(void **state)
+{
+    (void)state;
+    struct fl_block *limit = testbed_block("limit", "min", "-1", "max", "9", "rate", "10", NULL);
+    testbed_begin(limit);
+    assert_near(limited(limit, 7), 0.1, 1e-12);
+    testbed_step_after(limit, 35000000);
+    assert_near(GET(limit, "out", double), 0.45, 1e-12);
+    testbed_step_after(limit, 0);
+    assert_near(GET(limit, "out", double), 0.45, 1e-12);
+    testbed_end(limit);
+}
+
 static void refuses(void **state)
 {
     (void)state;
@@ -69,9 +82,8 @@ static void refuses(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(keeps_the_range),
-        cmocka_unit_test(holds_while_in_is_not_a_number),
-        cmocka_unit_test(keeps_the_rate),
+        cmocka_unit_test(keeps_the_range), cmocka_unit_test(holds_while_in_is_not_a_number),
+        cmocka_unit_test(keeps_the_rate),  cmocka_unit_test(keeps_the_rate_in_late_steps),
         cmocka_unit_test(refuses),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

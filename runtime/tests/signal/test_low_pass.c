@@ -27,6 +27,23 @@ static void follows_the_exponential(void **state)
     testbed_end(other);
 }
 
+/* Late steps, as where some were left out: the same curve. */
+static void follows_the_exponential_in_late_steps(void **state)
+{
+    (void)state;
+    struct fl_block *filter = testbed_block("low-pass", "time_constant", "0.5", NULL);
+    double time = 0;
+    testbed_begin(filter);
+    assert_near(filtered(filter, 3), 3, 0);
+    SET(filter, "in", double, 5);
+    for (int i = 0; i < 10; i++) {
+        assert_int_equal(testbed_step_after(filter, 35000000), FL_OK);
+        time += 0.035;
+        assert_near(GET(filter, "out", double), 3 + 2 * (1 - exp(-time / 0.5)), 1e-12);
+    }
+    testbed_end(filter);
+}
+
 static void leaves_out_what_is_not_finite(void **state)
 {
     (void)state;
@@ -55,6 +72,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(follows_the_exponential),
+        cmocka_unit_test(follows_the_exponential_in_late_steps),
         cmocka_unit_test(leaves_out_what_is_not_finite),
         cmocka_unit_test(without_time_constant_it_is_a_wire),
     };

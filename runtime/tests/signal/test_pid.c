@@ -173,6 +173,46 @@ static void continues_after_a_fault(void **state)
     testbed_end(pid);
 }
 
+static double controlled_after(struct fl_block *pid, double set_point, double measurement, int64_t interval_ns)
+{
+    SET(pid, "set_point", double, set_point);
+    SET(pid, "measurement", double, measurement);
+    assert_int_equal(testbed_step_after(pid, interval_ns), FL_OK);
+    return GET(pid, "out", double);
+}
+
+/* The integral grows and the derivative is by the time that passed. */
+static void goes_by_time_in_late_steps(void **state)
+{
+    (void)state;
+    struct fl_block *integral = testbed_block("pid", "ki", "5", "min", "-99", "max", "99", NULL);
+    struct fl_block *derivative = testbed_block("pid", "kd", "3", "min", "-99", "max", "99", NULL);
+    testbed_begin(integral);
+    testbed_begin(derivative);
+    controlled(integral, 2, 0);
+    controlled(derivative, 0, 0);
+    for (int i = 1; i <= 10; i++) {
+        assert_near(controlled_after(integral, 2, 0, 35000000), 5 * 2 * (h + 0.035 * (i - 1)), 1e-12);
+        assert_near(controlled_after(derivative, 0, 2 * 0.035 * i, 35000000), -6, 1e-9);
+    }
+    testbed_end(integral);
+    testbed_end(derivative);
+}
+
+/* A step at once after another: nothing is divided by no time, and the one after both sees all of the change. */
+static void its_derivative_takes_its_time(void **state)
+{
+    (void)state;
+    struct fl_block *pid = testbed_block("pid", "kd", "3", "min", "-99", "max", "99", NULL);
+    testbed_begin(pid);
+    controlled(pid, 0, 0);
+    assert_near(controlled(pid, 0, 2 * h), -6, 1e-9);
+    assert_near(controlled_after(pid, 0, 2 * h + 0.001, 0), -6, 1e-9);
+    assert_near(controlled_after(pid, 0, 2 * h + 0.002, 4999999), -6, 1e-9);
+    assert_near(controlled_after(pid, 0, 2 * h + 0.04, 5000001), -3 * 0.04 / 0.01, 1e-9);
+    testbed_end(pid);
+}
+
 static void refuses(void **state)
 {
     (void)state;
@@ -195,6 +235,8 @@ int main(void)
         cmocka_unit_test(survives_what_is_not_finite),
         cmocka_unit_test(its_integral_stays_finite),
         cmocka_unit_test(continues_after_a_fault),
+        cmocka_unit_test(goes_by_time_in_late_steps),
+        cmocka_unit_test(its_derivative_takes_its_time),
         cmocka_unit_test(refuses),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

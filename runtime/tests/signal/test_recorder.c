@@ -5,6 +5,7 @@
 
 #include <dirent.h>
 #include <inttypes.h>
+#include <sched.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -347,6 +348,38 @@ static void is_readable_after_a_kill(void **state)
     assert_int_equal(reading.bad, 0);
 }
 
+/* The policy of this process's thread of that name; -1: there is none. */
+static int policy_of(const char *name)
+{
+    char line[64], path[300], wanted[32];
+    int policy = -1;
+    snprintf(wanted, sizeof wanted, "%s\n", name);
+    DIR *threads = opendir("/proc/self/task");
+    assert_non_null(threads);
+    for (const struct dirent *thread; (thread = readdir(threads));) {
+        snprintf(path, sizeof path, "/proc/self/task/%s/comm", thread->d_name);
+        FILE *comm = fopen(path, "r");
+        if (!comm)
+            continue;
+        if (fgets(line, sizeof line, comm) && strcmp(line, wanted) == 0)
+            policy = sched_getscheduler(atoi(thread->d_name));
+        fclose(comm);
+    }
+    closedir(threads);
+    return policy;
+}
+
+/* Whatever the task's priority. */
+static void writes_at_ordinary_priority(void **state)
+{
+    (void)state;
+    struct fl_block *recorder = testbed_block(RECORDER, NULL);
+    recorder->service->priority = 79;
+    testbed_begin(recorder);
+    assert_int_equal(policy_of("recorder"), SCHED_OTHER);
+    testbed_end(recorder);
+}
+
 static void needs_its_directory(void **state)
 {
     (void)state;
@@ -388,6 +421,7 @@ int main(void)
         IN_DIRECTORY(gives_up_on_a_full_disk),
         IN_DIRECTORY(gives_up_on_a_disk_without_any_room),
         IN_DIRECTORY(is_readable_after_a_kill),
+        IN_DIRECTORY(writes_at_ordinary_priority),
         cmocka_unit_test(needs_its_directory),
         cmocka_unit_test(refuses),
     };
