@@ -2,6 +2,7 @@
 #include "inner.h"
 
 #include "block.h"
+#include "device.h"
 #include "parameter.h"
 #include "registry.h"
 
@@ -79,6 +80,7 @@ struct fl_inner *fl_inner_new(const char *type, double period_s)
     inner->block = block_create(found, beginning->name);
     inner->block->period_ns = period_ns ? period_ns : beginning->period_ns;
     inner->block->service->priority = service->priority;
+    inner->block->service->patience_ms = service->patience_ms;
     inner->next = service->inner;
     service->inner = inner;
     return inner;
@@ -223,6 +225,10 @@ void fl_inner_start(struct fl_inner *inner, const char *ports)
         fail(inner, type->name, reason);
         return;
     }
+    if (device_claim(block) != FL_OK) {
+        fail(inner, type->name, block->service->failure);
+        return;
+    }
     inner->started = true; /* terminate also cleans up after a start that failed halfway */
     if ((type->start && type->start(block) != FL_OK) || (type->initialize && type->initialize(block) != FL_OK))
         fail(inner, type->name, block->service->failure);
@@ -318,6 +324,16 @@ void fl_inner_end(const struct fl_block *outer)
 {
     for (struct fl_inner *inner = outer->service->inner; inner; inner = inner->next)
         fl_inner_terminate(inner);
+}
+
+int64_t inner_shortest(const struct fl_block *outer, int64_t (*of)(const struct fl_block *block))
+{
+    int64_t shortest = INT64_MAX;
+    for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next) {
+        int64_t value = inner->block ? of(inner->block) : INT64_MAX;
+        shortest = value < shortest ? value : shortest;
+    }
+    return shortest;
 }
 
 void inner_destroy(const struct fl_block *outer)

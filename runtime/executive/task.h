@@ -13,9 +13,10 @@ struct took {
 struct member {
     struct fl_block *block;
     int64_t every, offset;
-    struct took took; /* by its steps, after a run */
-    bool started;
-    bool incomplete; /* its ports are not known, because its parameters are wrong */
+    struct took took;     /* by its steps, after a run */
+    bool started, failed; /* `failed`: its start */
+    bool wrong;           /* its parameters */
+    bool incomplete;      /* its ports are not known, because its parameters are wrong */
 };
 
 struct task {
@@ -36,6 +37,10 @@ void task_free(struct task *task);
 /* "block.port" or "block.port[2]" of `task`: the signal, its type and its width; NULL with the reason in `reason`. */
 const void *task_signal(const struct task *task, const char *name, enum fl_type *type, uint32_t *width, char *reason,
                         size_t reason_size);
+
+/* The shortest time-out of an actuator (FL_ACTUATOR_TIMEOUT), of inner blocks too once they have started, in
+ * nanoseconds; INT64_MAX: there is none. */
+int64_t task_actuator_timeout(const struct task *task);
 
 /* The task as a graph for Graphviz. */
 void task_write_dot(const struct task *task, FILE *out);

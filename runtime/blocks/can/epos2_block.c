@@ -24,8 +24,10 @@ struct state {
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct epos2_block, interface, .fallback = "can0", .summary = "network interface of the bus"),
-    FL_PARAMETER(struct epos2_block, node, .min = 1, .max = 127, .summary = "the drive's node address"),
+    FL_PARAMETER(struct epos2_block, interface, .flags = FL_EXCLUSIVE, .fallback = "can0",
+                 .summary = "network interface of the bus"),
+    FL_PARAMETER(struct epos2_block, node, .flags = FL_EXCLUSIVE, .min = 1, .max = 127,
+                 .summary = "the drive's node address"),
     FL_PARAMETER(struct epos2_block, master, .fallback = "127", .min = 1, .max = 127,
                  .summary = "node address under which this block sends heartbeats: another for each drive"),
     FL_PARAMETER(struct epos2_block, mode, .choices = "position|velocity|current|profile-position|profile-velocity",
@@ -44,8 +46,8 @@ static const struct fl_parameter parameters[] = {
                  .summary = "of a quick stop; 0 leaves what the drive has stored"),
     FL_PARAMETER(struct epos2_block, max_current, .fallback = "0", .min = 0, .max = 32.767, .unit = "A",
                  .summary = "limit of the output current; 0 leaves what the drive has stored"),
-    FL_PARAMETER(struct epos2_block, timeout, .fallback = "0.1", .min = 1e-6, .max = 1e6, .unit = "s",
-                 .summary = "age from which a command, or a measurement, is too old"),
+    FL_PARAMETER(struct epos2_block, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "0.1", .min = 1e-6, .max = 1e6,
+                 .unit = "s", .summary = "age from which a command, or a measurement, is too old"),
     FL_PARAMETER(struct epos2_block, fault_reset, .fallback = "enable", .choices = "enable|automatic",
                  .summary = "what resets a fault: `enable` going from 0 to 1, or also the block, once a second"),
 };

@@ -9,7 +9,8 @@
  *   initialize   sets state and outputs as of time zero; not timed
  *   step         once each period of the block, in real time: no allocation, no call that may block
  *   await        where the block may be a task's `trigger`: waits, in real time, for what the next step shall take
- *   safe         an actuator's outputs go to their reset state; in real time, at any moment after start
+ *   safe         an actuator's outputs go to their reset state; in real time, at any moment after start, in any thread,
+ *                also in a signal handler while a step was left halfway: only what signal-safety(7) allows
  *   terminate    outputs to their reset state, devices closed; also after a start that failed halfway
  *
  * configure, start, initialize and step return 0, or FL_FAILED after fl_fail() has said why.
@@ -75,7 +76,10 @@ struct fl_texts {
     size_t count;
     const char *const *value;
 };
-struct fl_device { /* a device that one block has to itself: two blocks on one are an error */
+/* A device that one block has to itself: two blocks of a task on one are an error, and two tasks if the type has
+ * `safe`.
+ */
+struct fl_device {
     const char *path;
 };
 
@@ -94,8 +98,12 @@ enum {
     /* may be set while the task runs, between two steps: `step` reads it where it uses it. Not for texts and lists, and
      * not for what start, initialize or a driver's thread reads. */
     FL_TUNABLE = 1u << 0,
-    /* the choice names a device, such as a board by its address: of this type of block one only may have it */
+    /* names a device, such as a board by its address, alone or together with the others that have this flag: one block
+     * of this type may have it, in one task of the computer if the type has `safe` */
     FL_EXCLUSIVE = 1u << 1,
+    /* a time in seconds (double) after which the actuator's outputs go to their reset state without a new command; once
+     * no step of the task has ended for so long, but at least for five periods, it is ended with outputs made safe */
+    FL_ACTUATOR_TIMEOUT = 1u << 2,
 };
 
 struct fl_parameter {
