@@ -56,9 +56,23 @@ def hub() -> Iterator[UdpHub]:
     hub.close()
 
 
+Link = Callable[[str], None]
+"""Makes can0 what udp_can.c says: an index and `up`, `down` or `no-carrier`; nothing: there is none."""
+
+
 @pytest.fixture
-def run(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path) -> Callable[..., Any]:
-    environment = {"LD_PRELOAD": str(udp_can), "CAN_HUB": str(hub.port)}
+def link(tmp_path: Path) -> Link:
+    def become(state: str) -> None:
+        (tmp_path / "next").write_text(state)
+        (tmp_path / "next").rename(tmp_path / "link")
+
+    become("7 up")
+    return become
+
+
+@pytest.fixture
+def run(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path, link: Link) -> Callable[..., Any]:
+    environment = {"LD_PRELOAD": str(udp_can), "CAN_HUB": str(hub.port), "CAN_LINK": str(tmp_path / "link")}
     return lambda text, watched=WATCHED: running(
         [flotilla_run, "--watch", watched], tmp_path / "task.yml", text, environment
     )
@@ -139,6 +153,37 @@ def test_a_drive_that_lost_its_power_comes_back(run: Any, hub: UdpHub) -> None:
         with server.paused():
             drive.power_on()
         task.until(lambda row: row["enabled"] and row["velocity"] > 4.5)
+
+
+MISSING = "drive: there is no CAN interface can0: plug it in, and name it under `can:` in the inventory; waiting for it"
+DOWN = "drive: CAN interface can0 is down: name it under `can:` in the inventory, with the bus's bit rate"
+UP = "drive: CAN interface can0 is up"
+
+
+def test_waits_for_its_interface(run: Any, hub: UdpHub, link: Link, capfd: pytest.CaptureFixture[str]) -> None:
+    """An adapter is plugged in, set up, pulled out and plugged in again; each is said once."""
+    drive = Epos2(NODE)
+    said = ""
+    link("")
+    with Epos2Server(hub, drive).running(), run(drive_task("velocity", 5)) as task:
+        rows = task.rows()
+        assert not any(next(rows)["flag"] for _ in range(100)), "it steps, and has nothing to say"
+        link("7 down")
+        assert not any(next(rows)["flag"] for _ in range(100))
+        for state in ("7 up", "8 up"):
+            link(state)
+            task.until(lambda row: row["flag"])
+            said += capfd.readouterr().err
+            told = said.count(MISSING)
+            link("")
+            while said.count(MISSING) == told:
+                next(rows)
+                said += capfd.readouterr().err
+            task.until(lambda row: not row["flag"])
+        assert task.end() == 0
+    assert [line for line in said.splitlines() if "interface" in line] == [
+        MISSING, DOWN, UP, MISSING, UP, MISSING,
+    ]  # fmt: skip
 
 
 def test_a_stopped_task_stops_the_motor(run: Any, hub: UdpHub) -> None:

@@ -172,8 +172,13 @@ void epos2_begin(struct epos2 *drive, const struct epos2_settings *settings)
 {
     memset(drive, 0, sizeof *drive);
     drive->settings = *settings;
-    enter(drive, EPOS2_BOOTING, INT64_MIN / 2); /* long ago: the first reset is due */
+    epos2_lose(drive);
     drive->heartbeat_ns = drive->reset_ns = INT64_MIN / 2;
+}
+
+void epos2_lose(struct epos2 *drive)
+{
+    enter(drive, EPOS2_BOOTING, INT64_MIN / 2); /* long ago: the first reset is due */
 }
 
 void epos2_identifiers(const struct epos2_settings *settings, uint32_t identifiers[EPOS2_IDENTIFIERS])

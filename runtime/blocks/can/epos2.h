@@ -93,6 +93,9 @@ void epos2_identifiers(const struct epos2_settings *settings, uint32_t identifie
 
 void epos2_begin(struct epos2 *drive, const struct epos2_settings *settings);
 
+/* The connection to the bus was interrupted: begin the drive anew at the next epos2_advance. */
+void epos2_lose(struct epos2 *drive);
+
 /* Take a frame that arrived at `at_ns`. Any may come; those that are not the drive's, or malformed, change nothing. */
 void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t at_ns);
 

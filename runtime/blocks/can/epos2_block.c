@@ -1,5 +1,5 @@
-/* The block `epos2`: the drive of epos2.h on a CAN interface. It has no thread: a step takes what the kernel has
- * stamped and queued, and hands over what is to be sent, and neither can block. */
+/* The block `epos2`: the drive of epos2.h on a CAN interface. A step takes what the kernel has stamped and
+ * queued, and hands over what is to be sent, and neither can block; the thread of socket.h waits for the interface. */
 #include "epos2.h"
 #include "socket.h"
 
@@ -18,7 +18,7 @@ struct state {
     struct can_socket can;
     struct epos2 drive;
     struct fl_sensor sensor;
-    bool open;
+    uint32_t connections; /* of the interface, that the drive was begun on */
 };
 
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
@@ -122,11 +122,8 @@ static int start(struct fl_block *block)
     epos2_identifiers(&settings, identifiers);
     for (size_t i = 0; i < EPOS2_IDENTIFIERS; i++)
         filters[i] = (struct can_filter){identifiers[i], CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
-    if (can_open(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS) != FL_OK)
-        return FL_FAILED;
-    state->open = true;
     fl_sensor_begin(&state->sensor);
-    return FL_OK;
+    return can_start(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS);
 }
 
 static void send_all(struct state *state, const struct can_frame *frames, size_t count)
@@ -142,7 +139,8 @@ static void show(struct fl_block *block, struct state *state)
     const struct epos2 *drive = &state->drive;
     if (drive->sequence != state->sensor.sequence)
         fl_sensor_update(&state->sensor, drive->values_ns, drive->sequence);
-    fl_sensor_outputs(&state->sensor, block, FLAG, drive->phase == EPOS2_RUNNING && !state->can.bus_off, set->timeout);
+    bool there = drive->phase == EPOS2_RUNNING && can_connected(&state->can) && !atomic_load(&state->can.bus_off);
+    fl_sensor_outputs(&state->sensor, block, FLAG, there, set->timeout);
     FL_OUT(block, POSITION, double) = drive->values.position;
     FL_OUT(block, VELOCITY, double) = drive->values.velocity;
     FL_OUT(block, CURRENT, double) = drive->values.current;
@@ -150,6 +148,15 @@ static void show(struct fl_block *block, struct state *state)
     FL_OUT(block, ERROR, uint16_t) = drive->error_code;
     FL_OUT(block, ABORT, uint32_t) = drive->abort_code;
     FL_OUT(block, ENABLED, uint8_t) = FL_OUT(block, FLAG, bool) && epos2_enabled(drive);
+}
+
+/* A drive that could not be reached for a while is in any state: it is begun anew. */
+static void follow_interface(struct state *state)
+{
+    uint32_t connections = atomic_load(&state->can.connections);
+    if (connections != state->connections)
+        epos2_lose(&state->drive);
+    state->connections = connections;
 }
 
 static int step(struct fl_block *block)
@@ -164,7 +171,10 @@ static int step(struct fl_block *block)
     bool fresh = FL_IN(block, COMMAND_AGE, double) <= set->timeout;
     struct epos2_command command = {.enable = FL_IN(block, ENABLE, uint8_t),
                                     .target = fresh ? FL_IN(block, TARGET, double) : (double)NAN};
-    send_all(state, out, epos2_advance(&state->drive, block->release_ns, &command, out));
+    follow_interface(state);
+    /* On an interface that is away nothing is begun: what a driver has queued would reach the drive late. */
+    if (can_connected(&state->can))
+        send_all(state, out, epos2_advance(&state->drive, block->release_ns, &command, out));
     show(block, state);
     return FL_OK;
 }
@@ -173,18 +183,15 @@ static void safe(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    if (state->open)
-        send_all(state, out, epos2_disable(&state->drive, out));
+    send_all(state, out, epos2_disable(&state->drive, out));
 }
 
 static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    if (state->open)
-        send_all(state, out, epos2_farewell(&state->drive, out));
-    state->open = false;
-    can_close(&state->can);
+    send_all(state, out, epos2_farewell(&state->drive, out));
+    can_stop(&state->can);
 }
 
 FL_BLOCK(epos2) = {
