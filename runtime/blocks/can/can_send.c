@@ -77,9 +77,9 @@ static int configure(struct fl_block *block)
     return fl_add_input(block, (struct fl_port){.name = "age",
                                                 .type = FL_DOUBLE,
                                                 .width = 1,
-                                                .flags = FL_OPTIONAL,
                                                 .unit = "s",
-                                                .summary = "age of the data; without a wire they are always new"});
+                                                .summary = "age of the data: the output `age` of their "
+                                                           "source, or 0 where they are constant"});
 }
 
 static int start(struct fl_block *block)

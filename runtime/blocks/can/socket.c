@@ -106,6 +106,11 @@ static void tell(struct can_socket *can, int state)
                "there is no CAN interface %s: plug it in, and name it under `can:` in the inventory; waiting for it",
                interface);
         break;
+    case EAFNOSUPPORT:
+    case EPROTONOSUPPORT:
+        fl_log(can->block, "CAN interface %s: the kernel has no CAN: load the modules can and can-raw; trying on",
+               interface);
+        break;
     default:
         fl_log(can->block, "CAN interface %s: %s; trying on", interface, strerror(state));
         break;

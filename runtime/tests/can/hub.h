@@ -9,7 +9,7 @@
 #include <poll.h>
 #include <stdio.h>
 
-enum { HUB_CLIENTS = 4 };
+enum { HUB_CLIENTS = 8 };
 static int hub_fd;
 static struct sockaddr_in hub_clients[HUB_CLIENTS];
 static size_t hub_count;

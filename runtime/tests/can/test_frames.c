@@ -337,16 +337,73 @@ static void a_drive_is_disabled_by_safe_and_at_the_end(void **state)
     while (hub_take(&frame))
         ;
     block->type->safe(block);
-    assert_true(hub_take(&frame));
-    assert_int_equal(frame.can_id, 0x205);
-    assert_memory_equal(frame.data, "\0\0", 2);
+    const canid_t ways[] = {0x505, 0x205, 0x605};
+    for (size_t i = 0; i < 3; i++) {
+        assert_true(hub_take(&frame));
+        assert_int_equal(frame.can_id, ways[i]);
+    }
     assert_false(hub_take(&frame));
     testbed_end(block);
-    assert_true(hub_take(&frame));
-    assert_int_equal(frame.can_id, 0x205);
+    for (size_t i = 0; i < 3; i++) {
+        assert_true(hub_take(&frame));
+        assert_int_equal(frame.can_id, ways[i]);
+    }
     assert_true(hub_take(&frame));
     assert_int_equal(frame.can_id, 0);
     assert_memory_equal(frame.data, "\x82\x05", 2);
+    hub_close();
+}
+
+static unsigned syncs(void)
+{
+    struct can_frame frame;
+    unsigned count = 0;
+    while (hub_take(&frame))
+        count += frame.can_id == 0x080;
+    return count;
+}
+
+/* On one bus, here in one process as well as elsewhere: only the kernel knows of the claim. */
+static void one_block_sends_sync(void **state)
+{
+    (void)state;
+    enum { DRIVES = 4, STEPS = 10 };
+    struct fl_block *drives[DRIVES];
+    char node[4], master[4];
+    hub_open();
+    for (int i = 0; i < DRIVES; i++) {
+        snprintf(node, sizeof node, "%d", i + 1);
+        snprintf(master, sizeof master, "%d", 120 + i);
+        drives[i] = testbed_block("epos2", "node", node, "master", master, "mode", "velocity", NULL);
+        testbed_begin(drives[i]);
+    }
+    syncs();
+    for (int step = 0; step < STEPS; step++) {
+        for (int i = 0; i < DRIVES; i++) {
+            assert_int_equal(testbed_step(drives[i]), FL_OK);
+            assert_int_equal(syncs(), i == 0); /* the first that started */
+        }
+    }
+    testbed_end(drives[0]);
+    unsigned sent = 0;
+    for (int64_t from_ns = fl_now_ns(); !sent; sent = syncs()) { /* then one of the others takes over */
+        assert_true(fl_now_ns() - from_ns < INT64_C(30000000000));
+        for (int i = 1; i < DRIVES; i++)
+            assert_int_equal(testbed_step(drives[i]), FL_OK);
+    }
+    for (int step = 0; step < STEPS; step++) {
+        for (int i = 1; i < DRIVES; i++)
+            assert_int_equal(testbed_step(drives[i]), FL_OK);
+        assert_int_equal(syncs(), 1);
+    }
+    struct fl_block *silent = testbed_block("epos2", "node", "9", "mode", "velocity", "sync", "none", NULL);
+    for (int i = 1; i < DRIVES; i++)
+        testbed_end(drives[i]);
+    testbed_begin(silent);
+    for (int step = 0; step < STEPS; step++)
+        assert_int_equal(testbed_step(silent), FL_OK);
+    assert_int_equal(syncs(), 0);
+    testbed_end(silent);
     hub_close();
 }
 
@@ -383,6 +440,7 @@ int main(void)
         cmocka_unit_test(bus_off_ends_with_the_interface),
         cmocka_unit_test(a_drive_is_begun_anew_with_its_interface),
         cmocka_unit_test(a_drive_is_disabled_by_safe_and_at_the_end),
+        cmocka_unit_test(one_block_sends_sync),
         cmocka_unit_test(steps_never_block),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

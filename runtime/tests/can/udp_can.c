@@ -21,6 +21,7 @@
 #include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
+#include <sys/un.h>
 #include <unistd.h>
 
 enum { UDP_CAN_SOCKETS = 64, UDP_CAN_FILTERS = 16, UDP_CAN_INDEX = 7 };
@@ -130,11 +131,27 @@ int setsockopt(int fd, int level, int option, const void *value, socklen_t size)
                                                                                                     value, size);
 }
 
+/* An abstract Unix address says which bus it is about: others may run beside this one. */
+static int udp_can_bind_other(int fd, const struct sockaddr *address, socklen_t size)
+{
+    const char *hub = getenv("CAN_HUB");
+    struct sockaddr_un named;
+    if (hub && address->sa_family == AF_UNIX && size + strlen(hub) <= sizeof named) {
+        memcpy(&named, address, size);
+        if (!named.sun_path[0]) {
+            memcpy((char *)&named + size, hub, strlen(hub));
+            address = (const struct sockaddr *)&named;
+            size += (socklen_t)strlen(hub);
+        }
+    }
+    return ((int (*)(int, const struct sockaddr *, socklen_t))(uintptr_t)udp_can_real("bind"))(fd, address, size);
+}
+
 int bind(int fd, const struct sockaddr *address, socklen_t size)
 {
     struct udp_can *can = udp_can_of(fd);
     if (!can)
-        return ((int (*)(int, const struct sockaddr *, socklen_t))(uintptr_t)udp_can_real("bind"))(fd, address, size);
+        return udp_can_bind_other(fd, address, size);
     const struct sockaddr_can *asked = (const struct sockaddr_can *)(const void *)address;
     struct sockaddr_in hub = {.sin_family = AF_INET,
                               .sin_port = htons((uint16_t)atoi(getenv("CAN_HUB"))),
