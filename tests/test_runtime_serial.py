@@ -65,7 +65,8 @@ BATTERY_OUTPUTS = ("charge", "present", "charging", "voltage", "current", "tempe
 
 
 def batteries() -> OceanServer:
-    return OceanServer({1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}, charging=4)
+    measured = {1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}
+    return OceanServer(measured, charging=4, message="Low, charge now")
 
 
 def check_batteries(row: Row) -> None:

@@ -325,7 +325,9 @@ def test_oceanserver_obeys() -> None:
     assert masks == oceanserver.record("C1", (1, 2), (2, 2), (3, 0), (4, 0), (5, 0), (6, 0), (7, 0))
     assert battery == oceanserver.record("B12", (8, "0B94"), (9, "3A98"), (10, "FFEC"))
     assert charge == oceanserver.record("B12", (0x0D, "0032"))
-    assert controller.received(b" ") == [oceanserver.MENU]
+    controller.message = "Low, charge now"
+    assert controller.measure(2.0)[0] == oceanserver.record("S", (1, "270F"), (2, 0), (3, controller.message), (4, 50))
+    assert controller.received(b" ") == [charge, oceanserver.MENU]  # what is on the wire comes before the menu
     assert period_of(controller) is None
 
 
