@@ -214,6 +214,21 @@ def test_magnetometer(flotilla_run: Path, tmp_path: Path) -> None:
         run.until(good)
 
 
+@pytest.mark.parametrize("mode", ["stream", "poll", "raw"])
+def test_magnetometer_whatever_was_stored_in_it(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
+    """Mils, true north, NMEA, axes switched off."""
+    compass = magnetometer()
+    compass.settings = {"uc": "m", "sn": "t", "sdo": "n", "ec": "d", "ex": "d", "ey": "d", "ez": "d"}
+    with (
+        SerialLine(compass) as line,
+        watching(flotilla_run, tmp_path, line, "micromag3", "heading", "field", mode=mode, timeout=5) as run,
+    ):
+        row = run.until(good)
+        assert row["field"] == [-106, -403, 98]
+        assert row["heading"] == pytest.approx(0 if mode == "raw" else math.radians(194.74))
+        assert compass.settings["sn"] == "m"
+
+
 def test_magnetometer_with_unknown_checksums(flotilla_run: Path, tmp_path: Path) -> None:
     parameters = {"mode": "poll", "checksum": "none", "timeout": 5}
     with (
