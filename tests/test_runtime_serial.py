@@ -65,7 +65,8 @@ BATTERY_OUTPUTS = ("charge", "present", "charging", "voltage", "current", "tempe
 
 
 def batteries() -> OceanServer:
-    return OceanServer({1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}, charging=4)
+    measured = {1: Battery(charge=0.5), 3: Battery(voltage=15.5, current=1.25, charge=0.7)}
+    return OceanServer(measured, charging=4, message="Low, charge now")
 
 
 def check_batteries(row: Row) -> None:
@@ -211,6 +212,21 @@ def test_magnetometer(flotilla_run: Path, tmp_path: Path) -> None:
         run.until(bad)
         line.replug()
         run.until(good)
+
+
+@pytest.mark.parametrize("mode", ["stream", "poll", "raw"])
+def test_magnetometer_whatever_was_stored_in_it(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
+    """Mils, true north, NMEA, axes switched off."""
+    compass = magnetometer()
+    compass.settings = {"uc": "m", "sn": "t", "sdo": "n", "ec": "d", "ex": "d", "ey": "d", "ez": "d"}
+    with (
+        SerialLine(compass) as line,
+        watching(flotilla_run, tmp_path, line, "micromag3", "heading", "field", mode=mode, timeout=5) as run,
+    ):
+        row = run.until(good)
+        assert row["field"] == [-106, -403, 98]
+        assert row["heading"] == pytest.approx(0 if mode == "raw" else math.radians(194.74))
+        assert compass.settings["sn"] == "m"
 
 
 def test_magnetometer_with_unknown_checksums(flotilla_run: Path, tmp_path: Path) -> None:

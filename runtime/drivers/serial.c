@@ -13,6 +13,8 @@
 #include <sys/ioctl.h>
 #include <unistd.h>
 
+#define PATIENCE_NS (INT64_C(1000000000) * FL_SERIAL_PATIENCE_S)
+
 enum {
     SENDABLE = 16,
     SEND_BYTES = 64,
@@ -51,6 +53,9 @@ struct fl_serial {
     void *parser;
     uint32_t sequence;
     int open_error; /* last told */
+    struct fl_reasons reasons;
+    int64_t judged_ns; /* when the last measurement or reason came */
+    bool heard;        /* bytes since */
     _Atomic bool connected;
 };
 
@@ -134,19 +139,45 @@ static void forget_queued(struct fl_serial *serial)
         ;
 }
 
-static void feed(struct fl_serial *serial, const uint8_t *bytes, size_t count)
+/* The number of measurements that the bytes completed. */
+static unsigned feed(struct fl_serial *serial, const uint8_t *bytes, size_t count)
 {
     int64_t now_ns = fl_now_ns();
+    unsigned measurements = 0;
     for (size_t at = 0; at < count; at++) {
         struct arrival *arrival = serial->slots[serial->writing];
         if (!serial->protocol->feed(serial->parser, bytes[at], arrival->sample))
             continue;
+        measurements++;
         arrival->at_ns = now_ns;
         arrival->sequence = ++serial->sequence;
         if (serial->protocol->records)
             fl_ring_put(&serial->arrivals, arrival);
         else
             serial->writing = atomic_exchange(&serial->middle, serial->writing | FRESH) & ~(unsigned)FRESH;
+    }
+    return measurements;
+}
+
+/* Log what is wrong with what came, or that too little did. */
+static void judge(struct fl_serial *serial, size_t bytes, unsigned measurements)
+{
+    const struct fl_serial_settings *settings = &serial->settings;
+    int64_t now_ns = fl_now_ns();
+    const char *reason = serial->protocol->reason ? serial->protocol->reason(serial->parser, serial->parameters) : NULL;
+    serial->heard = serial->heard || bytes;
+    if (reason || measurements) {
+        if (reason)
+            fl_reasons_tell(&serial->reasons, serial->block, now_ns, "%s: %s", settings->device, reason);
+        else
+            fl_reasons_good(&serial->reasons, now_ns);
+        serial->judged_ns = now_ns;
+        serial->heard = false;
+    } else if (now_ns - serial->judged_ns > PATIENCE_NS) {
+        fl_reasons_tell(&serial->reasons, serial->block, now_ns,
+                        "%s: %s came for %d s: check the device's %s, and its rate, %" PRId64 " Bd", settings->device,
+                        serial->heard ? "bytes but no measurement" : "nothing", FL_SERIAL_PATIENCE_S,
+                        serial->heard ? "type" : "power, its cable", settings->baud);
     }
 }
 
@@ -155,21 +186,26 @@ static bool converse(struct fl_serial *serial, const struct fl_driver *driver, i
 {
     int64_t heard_ns = fl_now_ns();
     memset(serial->parser, 0, serial->protocol->parser_size);
+    serial->judged_ns = heard_ns;
+    serial->heard = false;
     if (!send_request(serial, driver, fd, FL_SERIAL_OPENED))
         return true;
     for (;;) {
         uint8_t bytes[BATCH];
+        ssize_t count = 0;
+        unsigned measurements = 0;
         int ready = fl_driver_wait(driver, fd, false, SILENCE_MS);
         if (ready < 0)
             return ready == -2;
         if (ready > 0) {
-            ssize_t count = read(fd, bytes, sizeof bytes);
+            count = read(fd, bytes, sizeof bytes);
             if (count == 0 || (count < 0 && errno != EAGAIN && errno != EINTR))
                 return true;
             if (count > 0)
-                feed(serial, bytes, (size_t)count);
+                measurements = feed(serial, bytes, (size_t)count);
             heard_ns = fl_now_ns();
         }
+        judge(serial, count > 0 ? (size_t)count : 0, measurements);
         int64_t silent_ms = ready > 0 ? 0 : (fl_now_ns() - heard_ns) / 1000000;
         if (!send_request(serial, driver, fd, silent_ms < INT_MAX ? (int)silent_ms : INT_MAX) ||
             !send_queued(serial, driver, fd))

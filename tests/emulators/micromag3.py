@@ -12,6 +12,9 @@ from tests.emulators.serial_line import Device
 
 Field = tuple[float, float, float]
 
+_VALUES = {"uc": "dm", "sn": "mt", "sdo": "tnr", "ec": "ed", "ex": "ed", "ey": "ed", "ez": "ed"}
+"""What each setting can be: one letter."""
+
 
 def checksum(text: bytes) -> int:
     """The exclusive or of all bytes."""
@@ -44,7 +47,10 @@ class MicroMag3(Device):
         """The board's error code; 0: none."""
         self.sums = sums
         """Whether its checksums are the documented ones; "unknown": as in the manual's example, where they are not."""
-        self.pollfreq = 8  # survives power cuts
+        # Those survive power cuts.
+        self.pollfreq = 8
+        self.settings = {"uc": "d", "sn": "m", "sdo": "t", "ec": "e", "ex": "e", "ey": "e", "ez": "d"}
+        """As the board is shipped: pages 18 to 28."""
         self._noise = noise
         self._random = random.Random(seed)
         self.power_on()
@@ -86,8 +92,7 @@ class MicroMag3(Device):
             case "s?":
                 return [self._sample()]
             case "sr?":
-                x, y, z = self._noisy(self.field(self._seconds))
-                return [record(f"raw,X{x:.0f}Y{y:.0f}Z{z:.0f}")]
+                return [self._raw()]
             case "pollfreq" if value.isdigit() and int(value) <= 16:
                 self.pollfreq = int(value)
                 return [record(f"pollfreq={self.pollfreq:02d}")]
@@ -95,15 +100,34 @@ class MicroMag3(Device):
                 return [record(f"pollfreq={self.pollfreq:02d}")]
             case "pollfreq":
                 return [record("pollfreq:E040")]
+        if name in self.settings:
+            if len(value) != 1 or value not in _VALUES[name]:
+                return [record(f"{name}:E040")]
+            self.settings[name] = value
+            return [record(command)]
         return [record(f"{name}:E010")]
 
     def _sample(self) -> bytes:
-        x, y, z = self._noisy(self.field(self._seconds))
         heading = (self.heading(self._seconds) + self._random.gauss(0, self._noise)) % 360
         heading = heading if round(heading, 2) < 360 else 0.0
-        text = f"C{heading:.2f}X{x:.2f}Y{y:.2f}Z{z:.2f}" + (f":E{self.error:X}" if self.error else "")
+        if self.settings["sdo"] == "n":
+            return record(f"HCHDM,{heading:.2f},M")
+        if self.settings["sdo"] == "r":
+            return self._raw()
+        told = f"{heading:.2f}" if self.settings["uc"] == "d" else f"{int(heading * 6400 / 360)}"
+        text = f"C{told}" if self.settings["ec"] == "e" else ""
+        text += self._axes(2) + (f":E{self.error:X}" if self.error else "")
         said = record(text)
         return said if self.sums == "xor" else said[:-4] + b"%02X\r\n" % (checksum(text.encode()) ^ 0x75)
+
+    def _raw(self) -> bytes:
+        return record(f"raw,{self._axes(0)}")
+
+    def _axes(self, decimals: int) -> str:
+        values = zip("XYZ", self._noisy(self.field(self._seconds)), strict=True)
+        return "".join(
+            f"{axis}{value:.{decimals}f}" for axis, value in values if self.settings[f"e{axis.lower()}"] == "e"
+        )
 
     def _noisy(self, field: Field) -> Field:
         x, y, z = (value + self._random.gauss(0, self._noise) for value in field)

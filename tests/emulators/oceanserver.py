@@ -37,6 +37,8 @@ class OceanServer(Device):
     minutes_left: int = NO_ESTIMATE
     charging: int = 0
     external_power: int = 0
+    message: str = ""
+    """What the controller has to say to people; it may have commas."""
     baud: int = 19200
     jitter: float = 0.05
 
@@ -57,18 +59,29 @@ class OceanServer(Device):
             if key in "xX" and self._awake:
                 self._streaming = True
             elif key == " " or self._awake:
+                if self._streaming:  # the record that is on the wire is finished
+                    answers.append(self._records()[-1])
                 self._awake = True
                 self._streaming = False
                 answers.append(MENU)
         return answers
 
     def measure(self, seconds: float) -> list[bytes]:
+        return self._records()
+
+    def _records(self) -> list[bytes]:
         present = sum(1 << (number - 1) for number in self.batteries)
         charge = sum(battery.charge for battery in self.batteries.values()) / max(1, len(self.batteries))
         discharging = present & ~self.charging
         masks = (present, self.charging, discharging, 0, self.external_power, 0, 0)
         records = [
-            record("S", (1, f"{self.minutes_left:04X}"), (2, 0), (4, round(charge * 100))),
+            record(
+                "S",
+                (1, f"{self.minutes_left:04X}"),
+                (2, 0),
+                *([(3, self.message)] if self.message else []),
+                (4, round(charge * 100)),
+            ),
             record("C1", *((number, mask) for number, mask in enumerate(masks, 1))),
         ]
         for number, battery in self.batteries.items():

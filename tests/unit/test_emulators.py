@@ -279,6 +279,7 @@ def test_micromag3_record() -> None:
     assert micromag3.record(text) == f"${text}*6B\r\n".encode()
     compass = MicroMag3(noise=0, sums="unknown")
     compass.error = 0x200
+    compass.settings["ez"] = "e"
     assert compass.received(b"s?\r") == [f"${text}*1E\r\n".encode()]
 
 
@@ -288,8 +289,16 @@ def test_micromag3_obeys() -> None:
     assert compass.received(b"poll") == []
     assert compass.received(b"freq=16\rgo\n") == [micromag3.record("pollfreq=16")]
     assert period_of(compass) == 1 / 16
-    assert compass.measure(0.0) == [micromag3.record("C194.74X-106.00Y-403.00Z98.00")]
-    assert compass.received(b"sr?\r\n") == [micromag3.record("raw,X-106Y-403Z98")]
+    assert compass.measure(0.0) == [micromag3.record("C194.74X-106.00Y-403.00")]
+    assert compass.received(b"sr?\r\n") == [micromag3.record("raw,X-106Y-403")]
+    assert compass.received(b"ez=e\rs?\rsr?\r") == [
+        micromag3.record("ez=e"),
+        micromag3.record("C194.74X-106.00Y-403.00Z98.00"),
+        micromag3.record("raw,X-106Y-403Z98"),
+    ]
+    assert compass.received(b"uc=m\rex=d\rs?\r")[2] == micromag3.record("C3462Y-403.00Z98.00")
+    assert compass.received(b"sdo=n\rs?\r")[1] == micromag3.record("HCHDM,194.74,M")
+    assert compass.received(b"sdo=x\rsdo=\r") == [micromag3.record("sdo:E040")] * 2
     assert compass.received(b"h\r") == [micromag3.record("h")]
     assert period_of(compass) is None
     assert compass.received(b"pollfreq=17\r") == [micromag3.record("pollfreq:E040")]
@@ -325,7 +334,9 @@ def test_oceanserver_obeys() -> None:
     assert masks == oceanserver.record("C1", (1, 2), (2, 2), (3, 0), (4, 0), (5, 0), (6, 0), (7, 0))
     assert battery == oceanserver.record("B12", (8, "0B94"), (9, "3A98"), (10, "FFEC"))
     assert charge == oceanserver.record("B12", (0x0D, "0032"))
-    assert controller.received(b" ") == [oceanserver.MENU]
+    controller.message = "Low, charge now"
+    assert controller.measure(2.0)[0] == oceanserver.record("S", (1, "270F"), (2, 0), (3, controller.message), (4, 50))
+    assert controller.received(b" ") == [charge, oceanserver.MENU]  # what is on the wire comes before the menu
     assert period_of(controller) is None
 
 

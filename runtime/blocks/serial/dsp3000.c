@@ -9,9 +9,15 @@ enum { CLOCKWISE, COUNTERCLOCKWISE };
 enum { IN_ZERO };
 enum { OUT_VALUE, OUT_FLAG };
 
+/* The gyro takes a command between two of its frames, or misses it, and does not say so. A line of text does not tell
+ * its mode, and a steady angle looks like a steady rate. So the mode is said after each line until a miss of all is out
+ * of the question (a fifth lost each time: 0.2^10, one start in ten millions), lines count only then, and it is said
+ * again ever after: a gyro that changed unseen is right again within a second. Only Z moves the angle, P does not. */
 enum {
-    REPEATS = 3, /* of a command: the gyro takes it between two of its frames, or misses it */
-    SETTLING = 5 /* lines of text that may still be of another mode, which they do not tell */
+    REPEATS = 10,
+    SETTLING = 2,  /* lines after the last of them that may still be of another mode */
+    REFRESH = 100, /* lines between two later commands */
+    ZEROS = 3,     /* times that Z is said */
 };
 
 static const double PI = 3.14159265358979323846;
@@ -64,16 +70,27 @@ static const struct fl_port status[] = {FL_SENSOR_OUTPUTS};
 struct parser {
     struct dsp3000_text text;
     struct dsp3000_words words;
-    uint8_t repeats, settling;
+    uint8_t repeats, settling, lines; /* commands and lines to come, lines since the last command */
+    bool fault;                       /* the gyro tells one */
+    double degrees;                   /* of the newest measurement */
 };
+
+static bool note(struct parser *self, const struct dsp3000_sample *sample)
+{
+    self->fault = !sample->valid;
+    self->degrees = sample->degrees;
+    return true;
+}
 
 static bool feed_text(void *parser, uint8_t byte, void *sample)
 {
     struct parser *self = parser;
     if (!dsp3000_text_feed(&self->text, byte, sample))
         return false;
-    if (self->settling) {
-        self->settling--;
+    note(self, sample);
+    if (self->repeats || self->settling) {
+        if (!self->repeats)
+            self->settling--;
         ((struct dsp3000_sample *)sample)->valid = false;
     }
     return true;
@@ -81,10 +98,11 @@ static bool feed_text(void *parser, uint8_t byte, void *sample)
 
 static bool feed_words(void *parser, uint8_t byte, void *sample)
 {
-    return dsp3000_words_feed(&((struct parser *)parser)->words, byte, sample);
+    struct parser *self = parser;
+    return dsp3000_words_feed(&self->words, byte, sample) && note(self, sample);
 }
 
-static size_t send_mode(void *parser, const void *given, int silent_ms, uint8_t *out, size_t size)
+static size_t say_mode(void *parser, const void *given, int silent_ms, uint8_t *out, size_t size)
 {
     static const char commands[] = {[DSP3000_RATE] = 'R', [DSP3000_INCREMENTAL] = 'A', [DSP3000_INTEGRATED] = 'P'};
     const struct dsp3000 *dsp3000 = given;
@@ -97,11 +115,40 @@ static size_t send_mode(void *parser, const void *given, int silent_ms, uint8_t 
         self->repeats = REPEATS;
         self->settling = SETTLING;
     }
-    if (silent_ms > 0 || silent_ms == FL_SERIAL_CLOSING || !self->repeats)
+    bool ended = self->text.ended || dsp3000->format == WORDS; /* words come ten times as often */
+    self->text.ended = false;
+    if (silent_ms > 0 || silent_ms == FL_SERIAL_CLOSING || (silent_ms == 0 && !ended))
         return 0;
-    self->repeats--;
+    if (self->repeats)
+        self->repeats--;
+    else if (dsp3000->format == WORDS || ++self->lines < REFRESH) /* a word tells its mode */
+        return 0;
+    self->lines = 0;
     *out = (uint8_t)commands[dsp3000->mode];
     return 1;
+}
+
+static const char *reason(void *parser, const void *given)
+{
+    const struct dsp3000 *dsp3000 = given;
+    struct parser *self = parser;
+    if (self->text.wrong) {
+        self->text.wrong = false;
+        return "a line is not the gyro's 21 bytes: check the cable and the format";
+    }
+    if (self->words.wrong) {
+        self->words.wrong = false;
+        return "the gyro sends words of another mode, and does not take the command: check its RxD line";
+    }
+    if (self->fault) {
+        self->fault = false;
+        return "the gyro reports a fault";
+    }
+    if (dsp3000->mode == DSP3000_RATE && fabs(self->degrees) * PI / 180 > dsp3000->full_scale) {
+        self->degrees = 0;
+        return "the gyro reports a rate beyond full_scale";
+    }
+    return NULL;
 }
 
 #define PROTOCOL(waiting, take)                                                                                        \
@@ -109,7 +156,8 @@ static size_t send_mode(void *parser, const void *given, int silent_ms, uint8_t 
      .sample_size = sizeof(struct dsp3000_sample),                                                                     \
      .records = (waiting),                                                                                             \
      .feed = (take),                                                                                                   \
-     .send = send_mode}
+     .send = say_mode,                                                                                                 \
+     .reason = reason}
 
 /* Increments are all needed: as many wait as come in a second. */
 static const struct fl_serial_protocol newest[] = {[TEXT] = PROTOCOL(0, feed_text), [WORDS] = PROTOCOL(0, feed_words)},
@@ -210,7 +258,7 @@ static void zero(struct fl_block *block)
     struct state *state = block->state;
     bool wanted = FL_IN(block, IN_ZERO, bool);
     if (wanted && !state->zero) {
-        state->zeros = REPEATS;
+        state->zeros = ZEROS;
         state->zeroed_at = state->heard - 1;
     }
     state->zero = wanted;

@@ -2,39 +2,46 @@
 
 #include "text.h"
 
+#include <stddef.h>
 #include <string.h>
 
 /* --- text --- */
 
-/* "(-)xxx.xxxxxx y": the manual's two words, between any spaces. */
-static bool parse(const char *line, struct dsp3000_sample *sample)
+/* Where a frame has what: the number's end, its point, and the digit of validity. */
+enum { NUMBER = 15, POINT = 8, VALID = 18 };
+
+/* "(-)xxx.xxxxxx", as wide as it need be, with spaces before it. */
+static bool parse(const char *frame, struct dsp3000_sample *sample)
 {
+    const char *at = frame + strspn(frame, " ");
+    const char *digits = at + (*at == '-');
     double degrees;
-    line += strspn(line, " ");
-    const char *number = line;
-    if (!read_decimal(&line, &degrees))
+    if (!read_decimal(&at, &degrees) || at != frame + NUMBER || frame[POINT] != '.')
         return false;
-    number += *number == '-';
-    const char *point = memchr(number, '.', (size_t)(line - number));
-    if (!point || line - point != 7 || point - number < 1 || point - number > 3)
+    ptrdiff_t before = frame + POINT - digits;
+    if (before < 1 || before > 3 || (before > 1 && *digits == '0'))
         return false;
-    size_t gap = strspn(line, " ");
-    char valid = line[gap];
-    if (!gap || (valid != '0' && valid != '1') || line[gap + 1 + strspn(line + gap + 1, " ")])
+    if (strspn(frame + NUMBER, " ") != VALID - NUMBER || (frame[VALID] != '0' && frame[VALID] != '1'))
         return false;
-    *sample = (struct dsp3000_sample){degrees, valid == '1'};
+    *sample = (struct dsp3000_sample){degrees, frame[VALID] == '1'};
     return true;
 }
 
 bool dsp3000_text_feed(struct dsp3000_text *text, uint8_t byte, struct dsp3000_sample *sample)
 {
     if (byte == '\n') {
-        bool ended = !text->overlong && text->length && text->line[text->length - 1] == '\r';
-        if (ended)
-            text->line[text->length - 1] = '\0';
+        bool whole = !text->overlong && text->length == DSP3000_LINE && text->line[DSP3000_LINE - 1] == '\r';
+        bool good = false;
+        if (whole) {
+            text->line[DSP3000_LINE - 1] = '\0';
+            good = parse(text->line, sample);
+        }
         text->length = 0;
         text->overlong = false;
-        return ended && parse(text->line, sample);
+        text->wrong |= !good && text->lines; /* of the first the beginning may be missing */
+        text->lines = true;
+        text->ended = true;
+        return good;
     }
     if (text->length == DSP3000_LINE || !byte)
         text->overlong = true;
@@ -87,6 +94,9 @@ bool dsp3000_words_feed(struct dsp3000_words *words, uint8_t byte, struct dsp300
     words->window = words->window << 8 | byte;
     if (words->received < 4 && ++words->received < 4)
         return false;
+    bool other = odd_parity(words->window) && words->window >> 31 && (words->window >> 27 & 3) != words->mode;
+    words->other[phase] = !other ? 0 : words->other[phase] < DSP3000_OTHER ? words->other[phase] + 1 : DSP3000_OTHER;
+    words->wrong |= words->other[phase] == DSP3000_OTHER;
     if (!possible(words->window, words->mode)) {
         *trust = *trust > DSP3000_DISTRUST ? (uint8_t)(*trust - DSP3000_DISTRUST) : 0;
         return false;

@@ -13,14 +13,19 @@ struct dsp3000_sample {
     bool valid;     /* the gyro's own judgement */
 };
 
-/* A line of text, "(-)xxx.xxxxxx y" with spaces around the two, ended by CR LF. It has no checksum: what does not look
- * like this to the last digit is dropped. */
-enum { DSP3000_LINE = 30 };
+/* A frame of text has 21 bytes: the number "(-)xxx.xxxxxx" at the right of 15, three spaces, 0 or 1, CR LF
+ * ("       0.015733   1" in the tests of ros-drivers/kvh_drivers). It has no checksum, but no byte of it can be lost or
+ * doubled unseen. What stays unseen is a byte that changes into another that could stand there: a digit into a digit,
+ * the sign into a space or a digit, a space before the number into a sign or a digit. */
+enum { DSP3000_LINE = 20 }; /* without LF */
 
 struct dsp3000_text {
     char line[DSP3000_LINE];
     uint8_t length;
     bool overlong; /* or not text: wait for the next line */
+    bool lines;    /* there was one */
+    bool wrong;    /* one was no frame, since the caller reset this */
+    bool ended;    /* one came, likewise */
 };
 
 bool dsp3000_text_feed(struct dsp3000_text *text, uint8_t byte, struct dsp3000_sample *sample);
@@ -35,10 +40,13 @@ struct dsp3000_words {
     uint8_t received; /* bytes, until there are four */
     uint8_t phase;    /* of the next byte */
     uint8_t trust[4]; /* by phase of the word's last byte */
+    uint8_t other[4]; /* words of another mode in a row, likewise */
+    bool wrong;       /* so many that the gyro is in another mode, since the caller reset this */
 };
 
 enum {
     DSP3000_TRUSTED = 8, /* words in a row before one is used: 2^-8 by parity alone, and the values must be possible */
+    DSP3000_OTHER = 64,  /* words of another mode in a row before it is told: 2^-64 by parity alone */
     DSP3000_DISTRUST = 4 /* what a wrong word costs: after a single one the stream is back in four milliseconds */
 };
 

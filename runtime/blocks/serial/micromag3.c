@@ -3,6 +3,7 @@
 #include <flotilla/driver.h>
 #include <flotilla/sensor.h>
 #include <stdio.h>
+#include <string.h>
 
 enum { XOR, NONE };
 enum { STREAM, POLL, RAW };
@@ -40,31 +41,73 @@ static const struct fl_port outputs[] = {
     [OUT_FIELD] = {.name = "field",
                    .type = FL_DOUBLE,
                    .width = 3,
-                   .summary = "magnetic field along x, y and z, in the board's units; stays as it was where the board "
-                              "is configured to send headings only"},
+                   .summary =
+                       "magnetic field along x, y and z, in the board's units; z is 0 where the board sends none, "
+                       "which it does in mode raw only"},
     [OUT_ERROR] = {.name = "error",
                    .type = FL_UINT16,
                    .width = 1,
                    .summary = "the board's error code of the newest sample, 0: none; others make the flag 0"},
     FL_SENSOR_OUTPUTS};
 
-/* --- the conversation: stop, set the rate, go on; each command once the one before was answered, or 100 ms later ---
- */
+/* --- the conversation: stop, set what measurements rely on, go on. Who had the board before may have stored other
+ * settings. Each command once the one before was answered, or was said in vain. --- */
 
-enum stage { STOPPING, SETTING, RUNNING };
+enum {
+    ATTEMPTS = 3, /* at a command, each of 100 ms of silence, */
+    SAMPLES = 4,  /* or of as many measurements where the board streams on */
+};
+
+/* Manual, pages 13 and 18 to 28. The board sends z in raw mode only; one without such a sensor refuses ez. */
+enum stage { STOPPING, FORMAT = 3, Z_AXIS = 7, RATE = 8, RUNNING };
+static const char *const commands[RUNNING] = {
+    "h", "uc=d", "sn=m", [FORMAT] = "sdo=t", "ec=e", "ex=e", "ey=e", [Z_AXIS] = "ez=e", [RATE] = "pollfreq="};
 
 struct parser {
     struct micromag3_parser frames;
-    uint8_t stage, answered;
-    bool sampled; /* since the last question */
+    uint8_t stage, attempts; /* attempts at the stage's command */
+    uint8_t samples;         /* since it was said last */
+    uint8_t vain;            /* the first stage whose command was said in vain, still to be told; 0: none */
+    uint16_t error;          /* that the board reports, likewise */
+    bool sampled;            /* since the last question */
+    char reason[96];
 };
 
 static bool feed(void *parser, uint8_t byte, void *sample)
 {
     struct parser *self = parser;
-    bool complete = micromag3_feed(&self->frames, byte, sample);
-    self->sampled |= complete;
-    return complete;
+    struct micromag3_sample read;
+    if (!micromag3_feed(&self->frames, byte, &read))
+        return false;
+    self->sampled = true;
+    self->samples++;
+    if (self->stage != RUNNING) /* of settings that may be another's */
+        return false;
+    self->error = read.error;
+    *(struct micromag3_sample *)sample = read;
+    return true;
+}
+
+static size_t say_command(struct parser *self, const struct micromag3 *micromag3, uint8_t *out, size_t size)
+{
+    self->samples = 0;
+    *self->frames.answer = '\0';
+    if (self->stage == RATE)
+        return (size_t)snprintf((char *)out, size, "%s%d\r", commands[RATE], (int)micromag3->pollfreq);
+    if (self->stage == FORMAT && micromag3->mode == RAW)
+        return (size_t)snprintf((char *)out, size, "sdo=r\r");
+    return (size_t)snprintf((char *)out, size, "%s\r", commands[self->stage]);
+}
+
+/* The board repeats what it took; the rate with two digits. */
+static bool answered(const struct parser *self, const struct micromag3 *micromag3)
+{
+    const char *answer = self->frames.answer;
+    if (self->stage == RATE)
+        return strncmp(answer, commands[RATE], strlen(commands[RATE])) == 0;
+    if (self->stage == FORMAT && micromag3->mode == RAW)
+        return strcmp(answer, "sdo=r") == 0;
+    return strcmp(answer, commands[self->stage]) == 0;
 }
 
 static size_t converse(void *parser, const void *given, int silent_ms, uint8_t *out, size_t size)
@@ -77,20 +120,50 @@ static size_t converse(void *parser, const void *given, int silent_ms, uint8_t *
     if (silent_ms == FL_SERIAL_OPENED || (self->stage == RUNNING && silent_ms > SILENT_MS)) {
         self->frames.any_checksum = micromag3->checksum == NONE;
         self->stage = STOPPING;
-        return (size_t)snprintf((char *)out, size, "h\r");
+        self->attempts = 1;
+        return say_command(self, micromag3, out, size);
     }
-    bool answered = self->answered != self->frames.answers;
-    self->answered = self->frames.answers;
     if (self->stage == RUNNING) {
         bool ask = micromag3->mode != STREAM && (self->sampled || silent_ms > 0);
         self->sampled = false;
         return ask ? (size_t)snprintf((char *)out, size, "%s", begin[micromag3->mode]) : 0;
     }
-    if (!answered && silent_ms == 0)
+    bool taken = answered(self, micromag3);
+    if (!taken && silent_ms == 0 && self->samples < SAMPLES)
         return 0;
-    if (self->stage++ == STOPPING)
-        return (size_t)snprintf((char *)out, size, "pollfreq=%d\r", (int)micromag3->pollfreq);
+    if (!taken && self->attempts < ATTEMPTS) {
+        self->attempts++;
+        return say_command(self, micromag3, out, size);
+    }
+    if (!taken && !self->vain && self->stage != STOPPING && self->stage != Z_AXIS)
+        self->vain = self->stage;
+    self->stage++;
+    self->attempts = 1;
+    if (self->stage != RUNNING)
+        return say_command(self, micromag3, out, size);
+    self->sampled = false;
     return (size_t)snprintf((char *)out, size, "%s", begin[micromag3->mode]);
+}
+
+static const char *reason(void *parser, const void *given)
+{
+    struct parser *self = parser;
+    const char *of_record = record_reason(&self->frames.record);
+    (void)given;
+    if (of_record)
+        return of_record;
+    if (self->error) {
+        snprintf(self->reason, sizeof self->reason, "the board reports error %X: manual, page 11", self->error);
+        self->error = 0;
+        return self->reason;
+    }
+    if (self->vain && self->stage == RUNNING) {
+        snprintf(self->reason, sizeof self->reason, "the board does not confirm settings, %s first: check its RxD line",
+                 commands[self->vain]);
+        self->vain = 0;
+        return self->reason;
+    }
+    return NULL;
 }
 
 static const struct fl_serial_protocol protocol = {
@@ -98,6 +171,7 @@ static const struct fl_serial_protocol protocol = {
     .sample_size = sizeof(struct micromag3_sample),
     .feed = feed,
     .send = converse,
+    .reason = reason,
 };
 
 /* --- the block --- */
@@ -155,7 +229,7 @@ FL_BLOCK(micromag3) = {
     .abi = FL_ABI,
     .name = "micromag3",
     .summary = "PNI MicroMag3 magnetometer on its RS-232 CommBoard",
-    .source = "PNI Legacy CommBoard user manual, pages 8 to 22",
+    .source = "PNI Legacy CommBoard user manual, pages 8 to 28",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct micromag3),

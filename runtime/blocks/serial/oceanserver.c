@@ -77,7 +77,8 @@ static bool feed(void *parser, uint8_t byte, void *sample)
 {
     struct parser *self = parser;
     bool complete = oceanserver_feed(&self->record, byte, sample);
-    if (complete)
+    /* Before the stream was asked for, this is one that was on the wire when the menu was called, and the last. */
+    if (complete && self->stage == ASKED)
         self->stage = STREAMING;
     return complete;
 }
@@ -100,6 +101,12 @@ static size_t converse(void *parser, const void *given, int silent_ms, uint8_t *
     return 0;
 }
 
+static const char *reason(void *parser, const void *given)
+{
+    (void)given;
+    return record_reason(&((struct parser *)parser)->record);
+}
+
 /* All records are needed, each has but a part; a whole round of them comes in a burst. */
 static const struct fl_serial_protocol protocol = {
     .parser_size = sizeof(struct parser),
@@ -107,15 +114,19 @@ static const struct fl_serial_protocol protocol = {
     .records = 64,
     .feed = feed,
     .send = converse,
+    .reason = reason,
 };
 
 /* --- the block --- */
+
+/* What is read of a battery. All but the charge, which some controllers leave out, must be there. */
+enum { TEMPERATURE, VOLTAGE, CURRENT, CHARGE, REGISTERS };
 
 struct state {
     struct fl_serial *serial;
     struct fl_sensor sensor;
     /* When which part arrived. The age is that of the oldest: what fails first is one battery's talk. */
-    int64_t system_ns, controller_ns, battery_ns[OCEANSERVER_BATTERIES];
+    int64_t system_ns, controller_ns, registers_ns[OCEANSERVER_BATTERIES][REGISTERS];
 };
 
 static int start(struct fl_block *block)
@@ -170,26 +181,42 @@ static void take_battery(struct fl_block *block, const struct oceanserver_sample
     unsigned battery = sample->battery - 1u;
     if (battery >= OCEANSERVER_BATTERIES)
         return;
-    if (oceanserver_value(sample, OCEANSERVER_B_TEMPERATURE, &value))
+    int64_t *arrived = ((struct state *)block->state)->registers_ns[battery];
+    if (oceanserver_value(sample, OCEANSERVER_B_TEMPERATURE, &value)) {
         ((double *)block->out[OUT_TEMPERATURE])[battery] = value / 10.0;
-    if (oceanserver_value(sample, OCEANSERVER_B_CURRENT, &value))
-        ((double *)block->out[OUT_CURRENT])[battery] = (int16_t)value / 1000.0;
-    if (oceanserver_value(sample, OCEANSERVER_B_CHARGE, &value))
-        ((double *)block->out[OUT_CHARGES])[battery] = value / 100.0;
+        arrived[TEMPERATURE] = arrived_ns;
+    }
     if (oceanserver_value(sample, OCEANSERVER_B_VOLTAGE, &value)) {
         ((double *)block->out[OUT_VOLTAGE])[battery] = value / 1000.0;
-        ((struct state *)block->state)->battery_ns[battery] = arrived_ns;
+        arrived[VOLTAGE] = arrived_ns;
     }
+    if (oceanserver_value(sample, OCEANSERVER_B_CURRENT, &value)) {
+        ((double *)block->out[OUT_CURRENT])[battery] = (int16_t)value / 1000.0;
+        arrived[CURRENT] = arrived_ns;
+    }
+    if (oceanserver_value(sample, OCEANSERVER_B_CHARGE, &value)) {
+        ((double *)block->out[OUT_CHARGES])[battery] = value / 100.0;
+        arrived[CHARGE] = arrived_ns;
+    }
+}
+
+static int64_t earlier(int64_t one_ns, int64_t other_ns)
+{
+    return one_ns < other_ns ? one_ns : other_ns;
 }
 
 /* When the oldest part arrived; 0 when one has not yet. Absent batteries say nothing. */
 static int64_t oldest(const struct fl_block *block)
 {
     const struct state *state = block->state;
-    int64_t oldest_ns = state->system_ns < state->controller_ns ? state->system_ns : state->controller_ns;
-    for (unsigned battery = 0; battery < OCEANSERVER_BATTERIES; battery++)
-        if (FL_OUT(block, OUT_PRESENT, uint8_t) >> battery & 1 && state->battery_ns[battery] < oldest_ns)
-            oldest_ns = state->battery_ns[battery];
+    int64_t oldest_ns = earlier(state->system_ns, state->controller_ns);
+    for (unsigned battery = 0; battery < OCEANSERVER_BATTERIES; battery++) {
+        if (!(FL_OUT(block, OUT_PRESENT, uint8_t) >> battery & 1))
+            continue;
+        for (unsigned part = 0; part < REGISTERS; part++)
+            if (part != CHARGE || state->registers_ns[battery][part])
+                oldest_ns = earlier(oldest_ns, state->registers_ns[battery][part]);
+    }
     return oldest_ns;
 }
 

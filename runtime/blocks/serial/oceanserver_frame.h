@@ -1,5 +1,6 @@
 /* What an OceanServer battery controller sends once it is told to stream in hexadecimal: records of number and value.
- */
+ * FFFF, or FF of two digits, may stand for a collision on the controller's SMBus, as its maker told the authors of
+ * gearbox (gbxsmartbatteryacfr/smartbatteryparsing.cpp). So a current of -1 mA is no measurement. */
 #ifndef FLOTILLA_OCEANSERVER_FRAME_H
 #define FLOTILLA_OCEANSERVER_FRAME_H
 
@@ -13,6 +14,7 @@ enum oceanserver_kind { OCEANSERVER_SYSTEM, OCEANSERVER_CONTROLLER, OCEANSERVER_
  */
 enum {
     OCEANSERVER_S_MINUTES = 0x01,
+    OCEANSERVER_S_TEXT = 0x03, /* a message, of any characters */
     OCEANSERVER_S_CHARGE = 0x04,
     OCEANSERVER_C_PRESENT = 0x01,
     OCEANSERVER_C_CHARGING = 0x02,
@@ -37,7 +39,7 @@ struct oceanserver_sample {
     } values[OCEANSERVER_VALUES];
 };
 
-/* The value of that number; false where the record has none. */
+/* The value of that number; false where the record has none, or a collision instead. */
 bool oceanserver_value(const struct oceanserver_sample *sample, uint8_t number, uint16_t *value);
 
 bool oceanserver_feed(struct record *record, uint8_t byte, struct oceanserver_sample *sample);

@@ -8,7 +8,7 @@ bool record_feed(struct record *record, uint8_t byte, char end)
 {
     /* Wherever a record was cut off, the next one begins. */
     if (byte == '$') {
-        *record = (struct record){.state = TEXT};
+        *record = (struct record){.state = TEXT, .reason = record->reason};
         return false;
     }
     int digit = hexadecimal((char)byte);

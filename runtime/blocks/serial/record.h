@@ -14,6 +14,7 @@ struct record {
     uint8_t length;
     uint8_t state;
     uint8_t computed, claimed; /* checksums */
+    const char *reason;        /* why one was not used, of the newest; NULL: none. For fl_serial_protocol.reason */
 };
 
 /* Take one byte of records that `end` ends. True when it completed one, its checksum still to be judged: the text is in
@@ -23,6 +24,14 @@ bool record_feed(struct record *record, uint8_t byte, char end);
 static inline bool record_sound(const struct record *record)
 {
     return record->computed == record->claimed;
+}
+
+/* The reason, once. */
+static inline const char *record_reason(struct record *record)
+{
+    const char *reason = record->reason;
+    record->reason = NULL;
+    return reason;
 }
 
 #endif

@@ -34,6 +34,29 @@ int fl_driver_wait(const struct fl_driver *driver, int fd, bool writable, int ti
 /* Wait, in a block's `await`, until `fd` is readable: true; or CLOCK_MONOTONIC is `until_ns`: false. */
 bool fl_await_readable(int fd, int64_t until_ns);
 
+/* --- why a device is not good --- */
+
+enum {
+    FL_REASONS = 8,           /* that are told before the device has to be good again */
+    FL_REASON_TEXT = 224,     /* bytes of one, with the 0 that ends it; a longer one is cut */
+    FL_REASONS_STEADY_S = 10, /* seconds without any, after which each may be told again */
+};
+
+/* What a driver's thread has told of its device. All zero at first. */
+struct fl_reasons {
+    unsigned count;
+    int64_t wrong_ns; /* when the newest reason was given, told or not */
+    char told[FL_REASONS][FL_REASON_TEXT];
+};
+
+/* Log why the device is not good, unless the same text was logged already. For a driver's thread, as often as it likes:
+ * never in a step, because it writes. */
+void fl_reasons_tell(struct fl_reasons *reasons, struct fl_block *block, int64_t now_ns, const char *format, ...)
+    __attribute__((format(printf, 4, 5)));
+
+/* The device is good. Once it has been so for FL_REASONS_STEADY_S, what goes wrong then is told anew. */
+void fl_reasons_good(struct fl_reasons *reasons, int64_t now_ns);
+
 /* --- serial port --- */
 
 /* Members and parameters of a block with a serial port, as the port's mask lists them. */
@@ -82,7 +105,15 @@ struct fl_serial_protocol {
      * the first byte is fed (silent_ms is FL_SERIAL_OPENED), after each batch of bytes (0), about every 100 ms of
      * silence with its length so far, and before an orderly end (FL_SERIAL_CLOSING). */
     size_t (*send)(void *parser, const void *parameters, int silent_ms, uint8_t *out, size_t size);
+
+    /* Why bytes that were fed since the last call are no good measurement, and what to do about it: a wrong checksum,
+     * another mode, a fault that the device tells. One line, which lasts until the next call; NULL: nothing is wrong.
+     * Called after each batch of bytes and in silence; the thread logs it by fl_reasons_tell. NULL where the protocol
+     * has nothing to add to what the thread finds by itself: no port, no bytes, bytes without a measurement. */
+    const char *(*reason)(void *parser, const void *parameters);
 };
+
+enum { FL_SERIAL_PATIENCE_S = 5 }; /* seconds without a measurement or a reason, after which the thread says so */
 
 struct fl_serial;
 

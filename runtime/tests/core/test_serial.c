@@ -1,5 +1,6 @@
 /* The serial port itself, with a pseudo terminal for a device. */
 #define _GNU_SOURCE
+#include "said.h"
 #include "serial/line.h"
 
 #include <asm/termbits.h>
@@ -306,14 +307,12 @@ static void opens_a_stuck_port_anew(void **state)
 static void says_once_why_it_cannot_open(void **state)
 {
     (void)state;
-    char said[4096] = "";
     struct line line = line_create();
     line_unplug(&line);
-    FILE *file = fopen(line.path, "w"), *log = tmpfile(); /* a file is no terminal */
-    assert_true(file && log);
+    FILE *file = fopen(line.path, "w"); /* a file is no terminal */
+    assert_non_null(file);
     fclose(file);
-    int error_output = dup(2);
-    dup2(fileno(log), 2);
+    struct said said = said_begin();
     struct fl_block *block = testbed_block("probe", "device", line.path, NULL);
     const struct probe *probe = block->parameters;
     unsigned attempts = configured;
@@ -324,18 +323,50 @@ static void says_once_why_it_cannot_open(void **state)
     line_plug(&line);
     AWAIT(fl_serial_connected(serial));
     fl_serial_stop(serial);
-    dup2(error_output, 2);
-    close(error_output);
-    rewind(log);
-    size_t count = fread(said, 1, sizeof said - 1, log);
-    said[count] = '\0';
-    fclose(log);
-    const char *reason = strstr(said, "Inappropriate ioctl");
-    assert_non_null(reason);
-    assert_null(strstr(reason + 1, "Inappropriate ioctl"));
-    assert_non_null(strstr(said, "is open"));
+    assert_int_equal(said_times(&said, "Inappropriate ioctl"), 1);
+    assert_int_equal(said_times(&said, "is open"), 1);
+    said_end(&said);
     line_unplug(&line);
     testbed_end(block);
+}
+
+static const char *why_not(void *parser, const void *given)
+{
+    const struct probe *probe = given;
+    return *(unsigned char *)parser % 2 ? NULL : probe->send == SEND_NOTHING ? "an even number" : NULL;
+}
+
+/* A protocol's own reason goes to the log once, however many bytes it is given for. */
+static void says_a_protocols_reason_once(void **state)
+{
+    (void)state;
+    struct fl_serial_protocol protocol = newest;
+    struct said said = said_begin();
+    protocol.reason = why_not;
+    struct bench bench = bench_create(&protocol, "nothing");
+    for (uint32_t number = 1; number < 100; number++) {
+        line_say(&bench.line, "x");
+        AWAIT(take_newest(&bench) && bench.sequence == number);
+    }
+    AWAIT(said_times(&said, "an even number"));
+    assert_int_equal(said_times(&said, "an even number"), 1);
+    assert_int_equal(said_times(&said, bench.line.path), 1);
+    bench_destroy(&bench);
+    said_end(&said);
+}
+
+/* And what the thread finds out by itself, of any protocol. */
+static void says_that_nothing_comes_or_nothing_of_use(void **state)
+{
+    (void)state;
+    struct said said = said_begin();
+    struct bench bench = bench_create(&newest, "nothing");
+    AWAIT(said_times(&said, "nothing came for 5 s: check the device's power, its cable, and its rate, 9600 Bd"));
+    line_write(&bench.line, "\0\0", 2); /* bytes that are no measurement */
+    AWAIT(said_times(&said, "bytes but no measurement came for 5 s: check the device's type, and its rate, 9600 Bd"));
+    assert_int_equal(said_times(&said, "probe: "), 2);
+    bench_destroy(&bench);
+    said_end(&said);
 }
 
 /* Seen to fail with TIOCEXCL, which stays when a process is killed. */
@@ -373,6 +404,8 @@ int main(void)
         cmocka_unit_test(says_why_it_sends),
         cmocka_unit_test(opens_a_stuck_port_anew),
         cmocka_unit_test(says_once_why_it_cannot_open),
+        cmocka_unit_test(says_a_protocols_reason_once),
+        cmocka_unit_test(says_that_nothing_comes_or_nothing_of_use),
         cmocka_unit_test(is_exclusive_while_open_only),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
