@@ -228,7 +228,7 @@ static void *control(void *argument)
         int64_t now_ns = fl_now_ns();
         statistics_add(&result->step, now_ns - begin_ns);
         if (failed)
-            end(result, ENDING_FAILED, failed, failed->service->failure);
+            end(result, failed->service->ended ? ENDING_DONE : ENDING_FAILED, failed, failed->service->failure);
         else if (executive->watch)
             watch_put(executive->watch, result->steps, release_ns, options->no_wait);
         result->steps++;

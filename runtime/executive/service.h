@@ -14,6 +14,8 @@ struct fl_memory {
 struct fl_service {
     struct fl_memory *memory;
     char failure[FL_FAILURE_BYTES];
+    bool ended;   /* by fl_end() */
+    bool *wired;  /* which inputs are */
     int priority; /* SCHED_FIFO of the block's threads; 0: ordinary */
     struct fl_port *in_ports, *out_ports;
     size_t near_used;          /* of the bytes beside the block */
