@@ -5,6 +5,11 @@ override BUILD := build
 ON_ROBOT := 1
 endif
 BUILD ?= build
+# Paths that stand in commands as they are.
+not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$
+in_path = $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1))
+$(foreach name,BUILD KEYS,$(if $(strip $(call in_path,$(name))),$(error $(name)=$(value $(name)): is a path with blanks \
+    or with a character that means something to a shell; take another directory)))
 export BUILD
 VENV := $(BUILD)/venv
 PYTHON := $(VENV)/bin/python
@@ -26,8 +31,8 @@ kernel: | setup ## our own real-time kernel as a Debian package: make kernel BOA
 	$(Q)$(FLOTILLA) kernel --board $(call need,BOARD)
 
 flash: | setup ## write a card and read it back: make flash ROBOT=3 DEV=/dev/sdX (or CARD=file)
-	$(Q)$(FLOTILLA) flash --robot $(call need,ROBOT) $(if $(CARD),--file $(CARD),--device $(call need,DEV)) \
-	    $(if $(FORCE),--force $(FORCE))
+	$(Q)$(FLOTILLA) flash --robot $(call need,ROBOT) $(or $(call option,--file,CARD),--device $(call need,DEV)) \
+	    $(call option,--force,FORCE)
 
 boot: | setup-tests ## boot a robot's image in QEMU on this terminal
 	$(Q)$(FLOTILLA) boot --robot $(call need,ROBOT)
@@ -53,13 +58,13 @@ fleet-down: | setup-tests ## end the virtual fleet
 	$(Q)$(PYTHON) -m tests.lab.fleet down
 
 fleet-scale: | setup-tests ## how provisioning grows with the fleet, on light robots, as root: make fleet-scale N=32 [BOARD=]
-	$(Q)$(PYTHON) -m tests.lab.scale measure $(call need,N) $(if $(BOARD),--board $(BOARD))
+	$(Q)$(PYTHON) -m tests.lab.scale measure $(call need,N) $(call option,--board,BOARD)
 
 provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [ARGS=--check]
 	$(Q)cd ansible && export PATH="$(abspath $(VENV))/bin:$$PATH" BUILD="$(abspath $(BUILD))" && \
 	    $(if $(KEYS),KEYS="$(abspath $(KEYS))") ansible-playbook -i inventory \
-	    $(if $(filter guests,$(ON)),-i $(abspath $(BUILD))/fleet/guests.yml -l $(if $(ROBOT),robot$(ROBOT),guests), \
-	        $(if $(ROBOT),-l robot$(ROBOT))) $(ARGS) $(or $(PLAYBOOK),fleet).yml
+	    $(if $(filter guests,$(ON)),-i $(abspath $(BUILD))/fleet/guests.yml -l $(if $(value ROBOT),robot$(call given,ROBOT),guests), \
+	        $(if $(value ROBOT),-l robot$(call given,ROBOT))) $(call each_given,ARGS) $(if $(value PLAYBOOK),$(call given,PLAYBOOK),fleet).yml
 
 ##@ Apps
 .PHONY: new-app deploy
@@ -67,7 +72,7 @@ new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=b
 	$(Q)$(FLOTILLA) new-app --kind $(call need,KIND) --name $(call need,NAME)
 
 deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [BUILD=remote] [KEEP=1 | RUN=start|stop|status|log|remove]
-	$(Q)$(FLOTILLA) deploy --robot $(call need,ROBOT) --app $(call need,APP) $(if $(RUN),--run $(RUN)) \
+	$(Q)$(FLOTILLA) deploy --robot $(call need,ROBOT) --app $(call need,APP) $(call option,--run,RUN) \
 	    $(if $(filter-out 0,$(KEEP)),--keep) $(if $(filter-out 0,$(ON_ROBOT)),--on-robot)
 
 ##@ Inputs
@@ -118,7 +123,7 @@ test-all: test ## the same, and tests that take minutes for one answer
 	$(Q)$(VENV)/bin/pytest tests -m long
 
 bench: | setup-tests ## wall times and ratios against other builders
-	$(Q)$(FLOTILLA) bench $(if $(ROBOT),--robot $(ROBOT))
+	$(Q)$(FLOTILLA) bench $(call option,--robot,ROBOT)
 
 ##@ Runtime
 .PHONY: runtime check-runtime fuzz bench-runtime param record live top
@@ -145,40 +150,40 @@ fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFu
 	$(Q)$(meson) test -C $(BUILD)/fuzz --suite fuzz --no-rebuild --print-errorlogs --quiet
 	$(Q)set -e; for known in runtime/tests/fuzz/corpus/*; do \
 	    name=$${known##*/}; found=$(BUILD)/found/$$name; \
-	    mkdir -p $$found; echo "$$name: $(or $(SECONDS),60) s"; \
-	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(or $(SECONDS),60) $(if $(SEED),-seed=$(SEED)) -max_len=1024 -timeout=10 -verbosity=0 \
+	    mkdir -p $$found; echo "$$name:" $(if $(value SECONDS),$(call given,SECONDS),60) s; \
+	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(if $(value SECONDS),$(call given,SECONDS),60) $(if $(value SEED),-seed=$(call given,SEED)) -max_len=1024 -timeout=10 -verbosity=0 \
 	        -artifact_prefix=$$found- $$found $$known 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
 bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
 	$(Q)images/install-host-packages runtime/bench/packages.txt
-	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(if $(SECONDS),--seconds $(SECONDS)) \
-	    $(if $(ROUNDS),--rounds $(ROUNDS))
+	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(call option,--seconds,SECONDS) \
+	    $(call option,--rounds,ROUNDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
-station = $(PYTHON) -m runtime.station $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ADDRESS),--live-address $(ADDRESS))
+station = $(PYTHON) -m runtime.station $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS)
 record: | setup ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS=]
-	$(Q)$(station) --record $(OUT) $(if $(PORT),--live $(PORT))
+	$(Q)$(station) --record $(call each_given,OUT) $(call option,--live,PORT)
 
 live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
-	$(Q)$(station) --live $(PORT) $(if $(OUT),--record $(OUT))
+	$(Q)$(station) --live $(call each_given,PORT) $(call option,--record,OUT)
 
 top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
-	$(Q)$(station) --top $(if $(filter-out 0,$(ASK)),--ask) $(if $(OUT),--record $(OUT)) $(if $(PORT),--live $(PORT))
+	$(Q)$(station) --top $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
 
 param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
-	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))
+	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
 
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck scenarios scenarios-accept
 LATENCY = $(PYTHON) -m tests.latency
 # What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.
-measured = --board $(or $(BOARD),smartcoret3) $(if $(KERNEL),--kernel $(KERNEL)) $(if $(PLAN),--plan $(PLAN))
+measured = --board $(if $(value BOARD),$(call given,BOARD),smartcoret3) $(call option,--kernel,KERNEL) $(call option,--plan,PLAN)
 latency: | setup-tests ## latency in virtual time within its limits, a control refused [BOARD= KERNEL=lean|debian|no-rt PLAN=quick|disk]; or TARGET=ssh:robot3
-	$(Q)$(LATENCY) measure $(measured) $(if $(TARGET),--target $(TARGET))
+	$(Q)$(LATENCY) measure $(measured) $(call option,--target,TARGET)
 	$(if $(TARGET),,$(Q)$(LATENCY) compare $(measured))
 
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
-	$(Q)$(FLOTILLA) hwcheck --robot $(call need,ROBOT) $(if $(SECONDS),--seconds $(SECONDS))
+	$(Q)$(FLOTILLA) hwcheck --robot $(call need,ROBOT) $(call option,--seconds,SECONDS)
 
 latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
 	$(Q)$(LATENCY) accept $(measured)
@@ -188,7 +193,7 @@ boot-time: | setup-tests ## where a boot spends its time, in virtual time
 	$(Q)$(LATENCY) boot-time $(measured)
 
 scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=1] [FLIGHTS="udp dds"] [ON=guests | ROBOTS=16]
-	$(Q)$(PYTHON) -m tests.scenarios $(if $(filter guests,$(ON)),--guests) $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SIDE),--side $(SIDE)) $(FLIGHTS)
+	$(Q)$(PYTHON) -m tests.scenarios $(if $(filter guests,$(ON)),--guests) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call each_given,FLIGHTS)
 
 scenarios-accept: | setup-tests ## make a new run the accepted one: commit tests/scenarios/baseline.json
 	$(Q)$(PYTHON) -m tests.scenarios --accept
@@ -213,5 +218,10 @@ clean: ## remove all outputs; keys stay
 help: ## this list
 	@awk -F ':.*## ' '/^##@/ {printf "\n%s\n", substr($$0, 5)} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-need = $(or $($1),$(error say which: make $@ $1=…))
+# What somebody gave reaches a program as it stands, as one word or as several: no shell reads it as a command.
+quoted = '$(subst ','\'',$1)'
+given = $(call quoted,$(value $1))
+each_given = $(foreach each,$(value $1),$(call quoted,$(each)))
+option = $(if $(value $2),$1 $(call given,$2))
+need = $(if $(value $1),$(call given,$1),$(error say which: make $@ $1=…))
 shell_scripts = git grep -l -E '^\#!/bin/(ba)?sh' -- images rootfs_overlay tests .ci

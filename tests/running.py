@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import threading
 import time
@@ -21,6 +22,14 @@ PATIENCE = 60
 
 Row = dict[str, Any]
 """What the watched signals are after a step; where all are of one block, by the names of its ports."""
+
+
+def free_port() -> int:
+    """A port of UDP that nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+        somebody.bind(("127.0.0.1", 0))
+        port: int = somebody.getsockname()[1]
+        return port
 
 
 def watching(signals: str) -> list[str]:

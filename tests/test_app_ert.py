@@ -6,6 +6,7 @@ Everything runs on this computer and with its compiler; tests/test_deploy.py tak
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -185,3 +186,24 @@ def test_a_task_that_does_not_fit_the_model_is_refused(
 ) -> None:
     with pytest.raises(AssertionError, match=said):
         run(flotilla_run, generated, TASK.replace(old, new), 1, "plain.command")
+
+
+MAIN = """\
+  /* Attach rt_OneStep to a timer or interrupt service routine with
+   * period 0.02 seconds (base rate of the model) here.
+   */
+"""
+"""What the coder's main programs of R2015a to R2023b say, but for the words in parentheses."""
+
+
+def test_a_model_of_one_rate_is_held_to_the_period_that_its_main_program_says(
+    flotilla_run: Path, generated: Path
+) -> None:
+    """Seen to fail where only step functions with numbers say their rates: the model ran at twice its rate."""
+    for file in (generated / "sample.h", generated / "sample.c"):
+        text = re.sub(r"^extern void sample_step1\(.*?;\n", "", file.read_text(), flags=re.MULTILINE | re.DOTALL)
+        file.write_text(text.replace("sample_step0", "sample_step"))
+    (generated / "ert_main.c").write_text(MAIN)
+    with pytest.raises(AssertionError, match=r"generated for a period of 20\.0 ms, and runs each 10 ms"):
+        run(flotilla_run, generated, TASK, 1, "plain.command")
+    assert app_ert.read("sample", app_ert.preprocess(generated, "sample"), MAIN, [0.01]).period_s == 0.01

@@ -11,9 +11,12 @@ import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ import pytest
 
 from images.builder import identity, paths
 from images.builder.inventory import load_fleet
+from tests.running import PATIENCE, free_port
 from tests.scenarios import virtual
 
 pytestmark = pytest.mark.alone
@@ -474,6 +478,65 @@ def test_no_step_follows_when_a_late_one_was_given_up(tasks: Tasks, tmp_path: Pa
             os.close(unread)
             os.close(full)
     check_reset(device)
+
+
+HEARD = "heard: {{type: udp-receive, parameters: {{port: {port}, length: 1, timeout: 3600}}}}"
+
+
+def test_a_task_that_waits_for_hours_ends_when_it_is_asked_to(tasks: Tasks, tmp_path: Path) -> None:
+    """Seen to fail where the thread sleeps until its next step: the service manager's patience is two seconds."""
+    device = tmp_path / "device"
+    waiting = {
+        "a step": task(TRACE.format(file=device), "period: 3600 s"),
+        "a trigger": task(
+            TRACE.format(file=device) + HEARD.format(port=free_port()),
+            "period: 3000 s\ntrigger: heard",
+        ),
+    }
+    for text in waiting.values():
+        with listening(tmp_path / "notify") as told:
+            process = subprocess.Popen(tasks.argv(text), env={**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")})
+            try:
+                while b"READY=1" not in told.recv(4096):
+                    pass
+                process.send_signal(signal.SIGTERM)
+                assert process.wait(PATIENCE) == 0
+            finally:
+                process.kill()
+                process.wait()
+        assert device.read_text().split()[-2:] == ["safe", "terminated"]
+        assert "on" not in device.read_text().split()
+
+
+def test_a_task_says_that_it_is_alive_for_as_long_as_its_next_step_may_take(tasks: Tasks, tmp_path: Path) -> None:
+    """A step comes 1.75 periods after another when the trigger is silent, and the first one after up to three.
+
+    Seen to fail where a task is alive for one period after its last step: then there are 40 words at most.
+    """
+    argv = tasks.argv(task(HEARD.format(port=free_port()), "period: 500 ms\ntrigger: heard"), "--watch", "heard.flag")
+    environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "50000"}
+    with listening(tmp_path / "notify") as told, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as rows:
+        rows.connect(str(tmp_path / "notify"))  # rows and words in one order: one thread says both
+        process = subprocess.Popen(argv, env=environment, stdout=rows.fileno())
+        try:
+            deadline, words = time.monotonic() + PATIENCE, 0
+            while words <= 45:  # one every 12.5 ms; a busy computer's many steps have one that is long enough
+                assert time.monotonic() < deadline, "it is silent before its next step"
+                said = told.recv(4096)
+                words = words + said.count(b"WATCHDOG=1") if b"heard.flag" not in said else 0
+        finally:
+            process.kill()
+            process.wait()
+
+
+@contextmanager
+def listening(path: Path) -> Iterator[socket.socket]:
+    """Where a task says how it is, as to the service manager."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told:
+        told.bind(str(path))
+        told.settimeout(PATIENCE)
+        yield told
+    path.unlink()
 
 
 def test_a_second_start_is_refused_and_a_killed_one_leaves_no_lock(

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.emulators.igps import Faults, Igps
-from tests.running import PATIENCE, Task, running, watching
+from tests.running import PATIENCE, Task, free_port, running, watching
 
 pytestmark = pytest.mark.alone
 
@@ -43,13 +43,6 @@ def refusal(flotilla_run: Path, tmp_path: Path) -> Callable[..., tuple[int, str]
         return ended.returncode, ended.stderr
 
     return run
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
-        somebody.bind(("127.0.0.1", 0))
-        port: int = somebody.getsockname()[1]
-        return port
 
 
 # --- indoor positioning ---

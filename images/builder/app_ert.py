@@ -46,6 +46,8 @@ _HEADERS = {
 """What the parser sees of the C library; of further headers nothing, since none of their types is a signal's."""
 _SAMPLE_TIME = re.compile(r"_step(\d+)\s*\([^)]*\)\s*/\*\s*Sample time: \[([0-9.eE+-]+)s,")
 """What the coder writes behind the head of each rate's step function."""
+_ONLY_SAMPLE_TIME = re.compile(r"rt_OneStep to a timer or interrupt service routine with[\s*/]+period ([0-9.eE+-]+) s")
+"""What it writes into ert_main.c, its example of a main program, where there is one rate."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ def block(directory: Path, model: str, name: str, sample_times_s: list[float], o
             remedy = f"{GENERATED}/ holds what Embedded Coder made of the model, whose name is the key model's"
             raise UserError(f"{paths.shown(file)} is missing; {remedy}")
     shutil.copytree(generated, out, ignore=shutil.ignore_patterns("ert_main.*", "*.o"))
-    found = read(model, preprocess(out, model), source.read_text(errors="replace"), sample_times_s)
+    said = "".join(path.read_text(errors="replace") for path in [source, *generated.glob("ert_main.*")])
+    found = read(model, preprocess(out, model), said, sample_times_s)
     found.inner = (out / INNER).is_file()
     (out / "flotilla_block.c").write_text(render(found, name))
 
@@ -142,7 +145,7 @@ def preprocess(generated: Path, model: str) -> str:
 def read(model: str, preprocessed: str, source: str, sample_times_s: list[float]) -> Model:
     """What the model consists of; UserError with what of it cannot become a block.
 
-    `source` is the model's C file, whose comments tell the rates where `sample_times_s` is empty.
+    `source` is the model's C file and ert_main.c, whose comments tell the rates where `sample_times_s` is empty.
     """
     try:
         tree = c_parser.CParser().parse(preprocessed, f"{model}.h")
@@ -223,6 +226,8 @@ class _Reader:
         """The step functions, and how often each runs."""
         numbers = [str(n) for n in range(len(self.functions)) if f"{self.model}_step{n}" in self.functions] or [""]
         said = {number: float(time) for number, time in _SAMPLE_TIME.findall(source)}
+        if numbers == [""] and (only := _ONLY_SAMPLE_TIME.search(source)):
+            said[""] = float(only[1])
         times = times_s or [said[number] for number in numbers if number in said]
         if len(times) != len(numbers) and (times_s or len(numbers) > 1):
             remedy = "say sample_times: [0.01, 0.05], fastest first, in seconds"

@@ -54,7 +54,7 @@ _C_TYPES = {"double": "double", "single": "float", "boolean": "bool"}
 """Of elements; those of integers are regular."""
 _RANGES = {
     "boolean": (0, 0), "text": (0, 0), "double": (-math.inf, math.inf), "single": (-3.4028234e38, 3.4028234e38),
-    "int64": (-9.2e18, 9.2e18), "uint64": (0, 9.2e18),
+    "int64": (-(2.0**63), 2.0**63), "uint64": (0, 2.0**64),
     **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32)},
     **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32)},
 }  # fmt: skip
@@ -81,6 +81,8 @@ class Variable:
     start: str
     """The value as a task file has it; of a parameter that is no array."""
     tunable: bool
+    optional: bool
+    """An input that has a start value, by which the unit goes where it has no wire."""
     min: float
     max: float
     """Equal: no limit."""
@@ -95,9 +97,14 @@ class Variable:
         """Of a parameter, in the block's structure of them."""
         if self.array:
             return "struct fl_reals"
-        return {"boolean": "bool", "double": "double", "single": "double", "text": "const char *"}.get(
-            self.type, "int64_t"
-        )
+        kinds = {
+            "boolean": "bool",
+            "single": "double",
+            "double": "double",
+            "uint64": "uint64_t",
+            "text": "const char *",
+        }
+        return kinds.get(self.type, "int64_t")
 
 
 @dataclass
@@ -110,6 +117,7 @@ class Unit:
     version: str
     """Of FMI: `2` or `3`."""
     identifier: str
+    """Of its binary; what C calls it has underlines for hyphens."""
     token: str
     """guid of 2.0, instantiationToken of 3.0."""
     once: bool
@@ -123,6 +131,8 @@ class Unit:
     inputs: list[Variable] = field(default_factory=list)
     outputs: list[Variable] = field(default_factory=list)
     parameters: list[Variable] = field(default_factory=list)
+    sizes: dict[str, str] = field(default_factory=dict)
+    """Of arrays whose size could be configured (FMI 3.0's structural parameters), by reference: it stays."""
     listed: list[str] = field(default_factory=list)
     """Files to compile, where there is no buildDescription.xml."""
 
@@ -198,7 +208,7 @@ def read(directory: Path, shown: str) -> Unit:
         remedy = "export it with all that it needs, as sources or a binary"
         raise _wrong(file, "needsExecutionTool", "true", "asks for the tool that made it, which robots lack", remedy)
     identifier, key = interface.get("modelIdentifier", ""), {"2": "guid", "3": "instantiationToken"}[version]
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", identifier):  # FMI allows no hyphens; tools write them
         raise _wrong(file, "modelIdentifier", identifier or "(nothing)", "is no identifier of C", "export it anew")
     token = root.get(key, "")
     if not token:
@@ -233,6 +243,8 @@ def _variables(unit: Unit, root: ElementTree.Element) -> None:
     types: dict[str | None, ElementTree.Element] = {}
     for each in root.iterfind("TypeDefinitions/*"):
         types[each.get("name")] = next(iter(each), each) if unit.version == "2" else each
+    for element in root.iterfind("ModelVariables/*[@causality='structuralParameter']"):
+        unit.sizes[element.get("valueReference", "")] = element.get("start", "(nothing)")
     for element in root.iterfind("ModelVariables/*"):
         causality = element.get("causality", "local")
         lists = {"input": unit.inputs, "output": unit.outputs, "parameter": unit.parameters}
@@ -309,6 +321,7 @@ def _variable(
         summary=summary if name == original else f"{original}: {summary}",
         start="" if array or element.get("causality") != "parameter" else _start(unit, original, typed, kind),
         tunable=tunable,
+        optional=typed.get("start") is not None,
         min=max(lowest, -1e300),
         max=min(highest, 1e300),
     )
@@ -316,7 +329,7 @@ def _variable(
 
 def _extent(unit: Unit, variable: str, dimension: ElementTree.Element) -> int:
     """The elements of an array in one dimension."""
-    text = dimension.get("start", "(nothing)")
+    text = dimension.get("start") or unit.sizes.get(dimension.get("valueReference", ""), "(nothing)")
     if not re.fullmatch(r"[1-9][0-9]{0,5}", text):
         message = "is no fixed number of elements"
         raise _wrong(unit.file, f"{variable}.Dimension.start", text, message, "export it with fixed sizes of arrays")
@@ -426,9 +439,10 @@ def render(unit: Unit, name: str) -> str:
     functions = [*begin, "SetDebugLogging", "EnterInitializationMode", "ExitInitializationMode", "DoStep", "Terminate"]
     functions += ["FreeInstance", *(f"Get{accessor}" for accessor in _groups(unit.outputs))]
     functions += [f"Set{accessor}" for accessor in _groups([*unit.inputs, *unit.parameters])]
+    asked = {"2": ["GetBooleanStatus", "GetRealStatus"], "3": []}[unit.version]
     file = "/".join(Path(unit.file).parts[-2:])  # within the app: where that lies makes no difference to the code
     template = environment.from_string(TEMPLATE.read_text())
-    return template.render(unit=unit, name=name, groups=_groups, functions=functions, file=file)
+    return template.render(unit=unit, name=name, groups=_groups, functions=functions, asked=asked, file=file)
 
 
 def build(unit: Unit, name: str, architecture: str, out: Path, run: toolchain.Run = toolchain.run) -> None:
@@ -438,7 +452,7 @@ def build(unit: Unit, name: str, architecture: str, out: Path, run: toolchain.Ru
     """
     final = out / object_of(name)
     final.parent.mkdir(parents=True)
-    if found := sources(unit, architecture):
+    if found := _sources_unless_binary(unit, architecture):
         final.write_bytes(_compiled(unit, found, architecture, run))
         final.chmod(0o755)  # as linkers leave it
     else:
@@ -447,6 +461,20 @@ def build(unit: Unit, name: str, architecture: str, out: Path, run: toolchain.Ru
         (final.parent / f"{unit.identifier}.so").rename(final)
     if unit.resources:
         shutil.copytree(unit.directory / "resources", final.parent.parent / "resources")
+
+
+def _sources_unless_binary(unit: Unit, architecture: str) -> Sources | None:
+    """What to compile; None where it lacks sources, or some of them cannot be, and brings a binary."""
+    try:
+        return sources(unit, architecture)
+    except UserError:
+        try:
+            binary(unit, architecture)
+        except UserError:
+            pass  # what is wrong with its sources says more
+        else:
+            return None
+        raise
 
 
 def _compiled(unit: Unit, found: Sources, architecture: str, run: toolchain.Run) -> bytes:

@@ -4,6 +4,7 @@
 #define FMI2_FUNCTIONS_H
 #include "fmi2FunctionTypes.h"
 #include "fmi2TypesPlatform.h"
+#include <stdlib.h> /* as the standard's own has it: sources rely on that */
 
 #define fmi2Version "2.0"
 #ifdef __cplusplus

@@ -4,6 +4,7 @@
 #define FMI3_FUNCTIONS_H
 #include "fmi3FunctionTypes.h"
 #include "fmi3PlatformTypes.h"
+#include <stdlib.h> /* as the standard's own has it: sources rely on that */
 
 #define fmi3Version "3.0"
 #ifdef __cplusplus

@@ -75,6 +75,21 @@ int fl_fail(struct fl_block *block, const char *format, ...)
     return FL_FAILED;
 }
 
+int fl_end(struct fl_block *block, const char *format, ...)
+{
+    va_list arguments;
+    va_start(arguments, format);
+    vsnprintf(block->service->failure, sizeof block->service->failure, format, arguments);
+    va_end(arguments);
+    block->service->ended = true;
+    return FL_FAILED;
+}
+
+bool fl_wired(const struct fl_block *block, uint32_t input)
+{
+    return block->service->wired[input];
+}
+
 void fl_log(struct fl_block *block, const char *format, ...)
 {
     char line[256];
@@ -156,7 +171,8 @@ int block_make_signals(struct fl_block *block)
 {
     void **out = place(block, sizeof(void *) * (block->out_count + 1));
     const void **in = place(block, sizeof(void *) * (block->in_count + 1));
-    if (!out || !in)
+    block->service->wired = fl_allocate(block, block->in_count + 1);
+    if (!out || !in || !block->service->wired)
         return FL_FAILED;
     for (uint32_t i = 0; i < block->out_count; i++)
         if (!(out[i] = place(block, fl_type_size(block->out_ports[i].type) * block->out_ports[i].width)))
@@ -173,6 +189,7 @@ int block_make_signals(struct fl_block *block)
 void block_wire(struct fl_block *block, uint32_t port, const void *signal)
 {
     ((const void **)(uintptr_t)block->in)[port] = signal;
+    block->service->wired[port] = true;
 }
 
 void block_destroy(struct fl_block *block)

@@ -28,9 +28,11 @@ enum {
     CATCH_UP_PERIODS = 10, /* further behind, the rest is left out */
     HOLDER_MS = 1000,      /* to make outputs safe that another process has, until it ends */
     LATE_PERIODS = 5,      /* from one step's end to the next one's: two for a late trigger, three for a late step */
+    HUNG_PERIODS = 10,     /* without a step, where no actuator's time-out says how many */
 };
 
 #define SECOND_NS INT64_C(1000000000)
+#define NAP_NS    (SECOND_NS / 2) /* a task that sleeps hears within that time that it has to end */
 
 struct executive {
     struct task *task;
@@ -135,11 +137,35 @@ static void touch_stack(void)
         stack[i] = 0;
 }
 
-static void sleep_until(int64_t release_ns)
+static bool asked_to_stop(struct executive *executive)
 {
-    const struct timespec release = {(time_t)(release_ns / SECOND_NS), (long)(release_ns % SECOND_NS)};
-    while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &release, NULL) == EINTR)
+    return atomic_load_explicit(&executive->stop, memory_order_relaxed);
+}
+
+static void sleep_until(int64_t wake_ns)
+{
+    const struct timespec wake = {(time_t)(wake_ns / SECOND_NS), (long)(wake_ns % SECOND_NS)};
+    while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &wake, NULL) == EINTR)
         continue;
+}
+
+/* Sleep until then, or until the task has to end: periods may be longer than the service manager waits for that. */
+static void sleep_unless_stopped(struct executive *executive, int64_t wake_ns)
+{
+    int64_t nap_ns;
+    while (!asked_to_stop(executive) && (nap_ns = fl_now_ns() + NAP_NS) < wake_ns)
+        sleep_until(nap_ns);
+    if (!asked_to_stop(executive))
+        sleep_until(wake_ns);
+}
+
+/* The same for what triggers a step; when it came, 0 if it did not. */
+static int64_t await_unless_stopped(struct executive *executive, struct fl_block *trigger, int64_t latest_ns)
+{
+    int64_t came_ns = 0, nap_ns;
+    while (!asked_to_stop(executive) && !came_ns && (nap_ns = fl_now_ns() + NAP_NS) < latest_ns)
+        came_ns = trigger->type->await(trigger, nap_ns);
+    return came_ns || asked_to_stop(executive) ? came_ns : trigger->type->await(trigger, latest_ns);
 }
 
 /* Wait until a step is due; when it was. `expected_ns`: when it should be, which what triggers it moves.
@@ -156,14 +182,14 @@ static int64_t wait_for_release(struct executive *executive, int64_t *expected_n
     if (executive->options->no_wait)
         return *expected_ns;
     if (!trigger) {
-        sleep_until(*expected_ns);
+        sleep_unless_stopped(executive, *expected_ns);
         return *expected_ns;
     }
     const int64_t earliest_ns = *expected_ns - early_ns, latest_ns = *expected_ns + late_ns;
-    sleep_until(earliest_ns);
-    int64_t came_ns = trigger->type->await(trigger, latest_ns);
+    sleep_unless_stopped(executive, earliest_ns);
+    int64_t came_ns = await_unless_stopped(executive, trigger, latest_ns);
     if (!came_ns) {
-        executive->result->timeouts++;
+        executive->result->timeouts += !asked_to_stop(executive);
         return latest_ns;
     }
     *expected_ns = came_ns > earliest_ns ? came_ns : earliest_ns;
@@ -210,8 +236,10 @@ static void *control(void *argument)
     touch_stack();
     /* By multiples of the period, so that tasks of one computer keep their phases to each other. */
     int64_t expected_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
-    while (!atomic_load_explicit(&executive->stop, memory_order_relaxed)) {
+    while (!asked_to_stop(executive)) {
         int64_t release_ns = wait_for_release(executive, &expected_ns);
+        if (asked_to_stop(executive))
+            break; /* this step is not due yet */
         int64_t begin_ns = fl_now_ns();
         if (!options->no_wait)
             statistics_add(&result->jitter, begin_ns - release_ns);
@@ -219,7 +247,7 @@ static void *control(void *argument)
         int64_t now_ns = fl_now_ns();
         statistics_add(&result->step, now_ns - begin_ns);
         if (failed)
-            end(result, ENDING_FAILED, failed, failed->service->failure);
+            end(result, failed->service->ended ? ENDING_DONE : ENDING_FAILED, failed, failed->service->failure);
         else if (executive->watch)
             watch_put(executive->watch, result->steps, release_ns, options->no_wait);
         result->steps++;
@@ -259,7 +287,7 @@ static int64_t patience_of(const struct executive *executive)
     const struct task *task = executive->task;
     int64_t patience_ns = executive->options->no_wait ? INT64_MAX : task_actuator_timeout(task);
     if (patience_ns == INT64_MAX) /* there is none, or time is not measured */
-        return 10 * task->period_ns + SECOND_NS;
+        return HUNG_PERIODS * task->period_ns + SECOND_NS;
     return patience_ns > LATE_PERIODS * task->period_ns ? patience_ns : LATE_PERIODS * task->period_ns;
 }
 
@@ -333,7 +361,8 @@ static void end_as_asked(const struct executive *executive)
 static void serve(struct executive *executive, int signals_fd)
 {
     uint64_t usec = 0, last = 0;
-    int64_t period_ns = executive->task->period_ns, moved_ns = fl_now_ns(), notified_ns = 0;
+    int64_t moved_ns = fl_now_ns(), notified_ns = 0;
+    const int64_t patience_ns = HUNG_PERIODS * executive->task->period_ns;
     bool guarded = sd_watchdog_enabled(0, &usec) > 0;
     int64_t interval_ns = guarded ? (int64_t)usec * 1000 / 4 : SECOND_NS;
     int64_t wake_ms = executive->watch ? WATCH_MS : interval_ns / 1000000;
@@ -345,8 +374,8 @@ static void serve(struct executive *executive, int signals_fd)
             take_signal(executive, signals_fd);
         int64_t now_ns = fl_now_ns();
         uint64_t steps = status_steps(executive->status);
-        /* Only a task that steps may say that it is alive. */
-        if (guarded && (steps != last || period_ns > now_ns - moved_ns) && now_ns - notified_ns >= interval_ns) {
+        /* Only a task that steps may say that it is alive; the guard comes first when it does not. */
+        if (guarded && (steps != last || patience_ns > now_ns - moved_ns) && now_ns - notified_ns >= interval_ns) {
             sd_notify(0, "WATCHDOG=1");
             notified_ns = now_ns;
         }

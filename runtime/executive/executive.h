@@ -18,6 +18,7 @@
 enum ending {
     ENDING_NONE,
     ENDING_ASKED,   /* a signal, or all steps done */
+    ENDING_DONE,    /* a block's fl_end() */
     ENDING_FAILED,  /* a block's start, initialize or step */
     ENDING_OVERRUN, /* overrun policy stop-safe, or too many in a row */
 };

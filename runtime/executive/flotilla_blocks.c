@@ -18,9 +18,9 @@ static const char usage[] =
     "  --help, --version\n";
 
 static const char *const kinds[] = {
-    [FL_KIND_BOOLEAN] = "boolean", [FL_KIND_INTEGER] = "integer", [FL_KIND_REAL] = "real",
-    [FL_KIND_TEXT] = "text",       [FL_KIND_REALS] = "reals",     [FL_KIND_TEXTS] = "texts",
-    [FL_KIND_CHOICE] = "choice",   [FL_KIND_DEVICE] = "device",
+    [FL_KIND_BOOLEAN] = "boolean", [FL_KIND_INTEGER] = "integer", [FL_KIND_UNSIGNED] = "unsigned",
+    [FL_KIND_REAL] = "real",       [FL_KIND_TEXT] = "text",       [FL_KIND_REALS] = "reals",
+    [FL_KIND_TEXTS] = "texts",     [FL_KIND_CHOICE] = "choice",   [FL_KIND_DEVICE] = "device",
 };
 
 static const char *given(const char *text)

@@ -169,7 +169,7 @@ static int run(struct command *command, struct task *task)
     bool written = !command->statistics || write_statistics(command->statistics, task, &result);
     if (result.ending != ENDING_ASKED)
         fprintf(stderr, "flotilla: %s: %s; outputs are in their reset state\n", task->name, result.reason);
-    return result.ending == ENDING_ASKED && written ? 0 : 1;
+    return (result.ending == ENDING_ASKED || result.ending == ENDING_DONE) && written ? 0 : 1;
 }
 
 int main(int argc, char **argv)

@@ -242,6 +242,8 @@ static double number(const struct fl_parameter *parameter, const void *place)
         return *(const bool *)place;
     case FL_KIND_INTEGER:
         return (double)*(const int64_t *)place;
+    case FL_KIND_UNSIGNED:
+        return (double)*(const uint64_t *)place;
     default:
         return *(const double *)place;
     }
@@ -255,6 +257,9 @@ static void put(const struct fl_parameter *parameter, void *place, double value)
         break;
     case FL_KIND_INTEGER:
         *(int64_t *)place = (int64_t)value;
+        break;
+    case FL_KIND_UNSIGNED:
+        *(uint64_t *)place = (uint64_t)value;
         break;
     default:
         *(double *)place = value;

@@ -48,7 +48,8 @@ static const char *given(const struct subject *subject, const struct fl_paramete
 
 static bool is_number(const struct fl_parameter *parameter)
 {
-    return parameter->kind == FL_KIND_BOOLEAN || parameter->kind == FL_KIND_INTEGER || parameter->kind == FL_KIND_REAL;
+    return parameter->kind == FL_KIND_BOOLEAN || parameter->kind == FL_KIND_INTEGER ||
+           parameter->kind == FL_KIND_UNSIGNED || parameter->kind == FL_KIND_REAL;
 }
 
 static bool is_tunable(const struct fl_parameter *parameter)
@@ -80,6 +81,7 @@ static void put_anything(struct fl_inner *inner, const struct fl_parameter *para
     switch (parameter->kind) {
     case FL_KIND_BOOLEAN:
     case FL_KIND_INTEGER:
+    case FL_KIND_UNSIGNED:
     case FL_KIND_REAL:
         fl_inner_numbers(inner, parameter->name, &least, 1);
         break;

@@ -16,6 +16,7 @@ static const char *const kind_names[] = {
     [FL_KIND_TEXTS] = "a list of texts",
     [FL_KIND_CHOICE] = "one of its choices",
     [FL_KIND_DEVICE] = "a device's path",
+    [FL_KIND_UNSIGNED] = "a whole number from 0",
 };
 
 bool read_integer(const char *text, int64_t *value)
@@ -27,6 +28,21 @@ bool read_integer(const char *text, int64_t *value)
         return false;
     errno = 0;
     long long read = strtoll(text, &end, hexadecimal ? 16 : 10);
+    if (errno || *end)
+        return false;
+    *value = read;
+    return true;
+}
+
+bool read_unsigned(const char *text, uint64_t *value)
+{
+    char *end;
+    const char *digits = text + (*text == '+');
+    bool hexadecimal = digits[0] == '0' && (digits[1] == 'x' || digits[1] == 'X');
+    if (!isdigit((unsigned char)*digits))
+        return false;
+    errno = 0;
+    unsigned long long read = strtoull(text, &end, hexadecimal ? 16 : 10);
     if (errno || *end)
         return false;
     *value = read;
@@ -142,6 +158,12 @@ static bool read_kind(struct fl_block *block, const struct fl_parameter *paramet
         if (!in_range(parameter, (double)*(int64_t *)place))
             *outside = text;
         return true;
+    case FL_KIND_UNSIGNED:
+        if (!read_unsigned(text, place))
+            return false;
+        if (!in_range(parameter, (double)*(uint64_t *)place))
+            *outside = text;
+        return true;
     case FL_KIND_REAL:
         if (!read_real(text, place))
             return false;
@@ -173,6 +195,7 @@ size_t parameter_size(enum fl_kind kind)
         [FL_KIND_TEXTS] = sizeof(struct fl_texts),
         [FL_KIND_CHOICE] = sizeof(int),
         [FL_KIND_DEVICE] = sizeof(struct fl_device),
+        [FL_KIND_UNSIGNED] = sizeof(uint64_t),
     };
     return sizes[kind];
 }
@@ -263,6 +286,9 @@ void parameter_write(const struct fl_parameter *parameter, const void *parameter
         break;
     case FL_KIND_INTEGER:
         fprintf(out, "%" PRId64, *(const int64_t *)place);
+        break;
+    case FL_KIND_UNSIGNED:
+        fprintf(out, "%" PRIu64, *(const uint64_t *)place);
         break;
     case FL_KIND_REAL:
         write_real(*(const double *)place, out);

@@ -36,6 +36,7 @@ void parameters_set(struct fl_block *block, const struct written *written, size_
 
 /* Numbers as task files write them: decimal or 0x…, with an optional unit of time for times. */
 bool read_integer(const char *text, int64_t *value);
+bool read_unsigned(const char *text, uint64_t *value);
 bool read_real(const char *text, double *value);
 
 /* "10 ms", "1 s", "500 us": nanoseconds. */

@@ -14,6 +14,8 @@ struct fl_memory {
 struct fl_service {
     struct fl_memory *memory;
     char failure[FL_FAILURE_BYTES];
+    bool ended;      /* by fl_end() */
+    bool *wired;     /* which inputs are */
     int priority;    /* SCHED_FIFO of the block's threads; 0: ordinary */
     int patience_ms; /* how long to wait for a device that another process holds */
     int claim_fd;    /* holds the block's device (device.h); below 1: none */

@@ -203,6 +203,7 @@ const void *task_signal(const struct task *task, const char *name, enum fl_type 
 static bool put_constant(const char *text, enum fl_type type, void *place)
 {
     int64_t integer;
+    uint64_t count;
     double real;
     switch (type) {
     case FL_BOOLEAN:
@@ -223,7 +224,10 @@ static bool put_constant(const char *text, enum fl_type type, void *place)
     case FL_INT64:
         PUT_INTEGER(int64_t, INT64_MIN, INT64_MAX);
     case FL_UINT64:
-        PUT_INTEGER(uint64_t, 0, INT64_MAX);
+        if (!read_unsigned(text, &count))
+            return false;
+        *(uint64_t *)place = count;
+        return true;
     case FL_SINGLE:
         if (!read_real(text, &real))
             return false;
@@ -249,6 +253,7 @@ static void wire_constants(struct building *building, struct fl_block *block, ui
     const struct fl_port *to = &block->in_ports[port];
     size_t size = fl_type_size(to->type);
     char *place = (char *)(uintptr_t)block->in[port];
+    block_wire(block, port, place); /* to itself */
     if (written->count != to->width) {
         problem(building->problems, written->line, "block %s: input %s has %u elements, not %zu", block->name, to->name,
                 (unsigned)to->width, written->count);

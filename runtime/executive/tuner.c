@@ -119,7 +119,8 @@ static const struct fl_parameter *find(const struct tuner *tuner, struct client 
 static bool tunable(const struct fl_parameter *parameter)
 {
     enum fl_kind kind = parameter->kind;
-    bool plain = kind == FL_KIND_BOOLEAN || kind == FL_KIND_INTEGER || kind == FL_KIND_REAL || kind == FL_KIND_CHOICE;
+    bool plain = kind == FL_KIND_BOOLEAN || kind == FL_KIND_INTEGER || kind == FL_KIND_UNSIGNED ||
+                 kind == FL_KIND_REAL || kind == FL_KIND_CHOICE;
     return plain && parameter->flags & FL_TUNABLE;
 }
 

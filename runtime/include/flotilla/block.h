@@ -13,7 +13,7 @@
  *                also in a signal handler while a step was left halfway: only what signal-safety(7) allows
  *   terminate    outputs to their reset state, devices closed; also after a start that failed halfway
  *
- * configure, start, initialize and step return 0, or FL_FAILED after fl_fail() has said why.
+ * configure, start, initialize and step return 0, or FL_FAILED after fl_fail() has said why; step also after fl_end().
  */
 #ifndef FLOTILLA_BLOCK_H
 #define FLOTILLA_BLOCK_H
@@ -84,14 +84,15 @@ struct fl_device {
 };
 
 enum fl_kind {
-    FL_KIND_BOOLEAN, /* bool */
-    FL_KIND_INTEGER, /* int64_t */
-    FL_KIND_REAL,    /* double */
-    FL_KIND_TEXT,    /* const char * */
-    FL_KIND_REALS,   /* struct fl_reals: a list, or one number */
-    FL_KIND_TEXTS,   /* struct fl_texts: a list, or one text */
-    FL_KIND_CHOICE,  /* int: the index among `choices` */
-    FL_KIND_DEVICE,  /* struct fl_device */
+    FL_KIND_BOOLEAN,  /* bool */
+    FL_KIND_INTEGER,  /* int64_t */
+    FL_KIND_REAL,     /* double */
+    FL_KIND_TEXT,     /* const char * */
+    FL_KIND_REALS,    /* struct fl_reals: a list, or one number */
+    FL_KIND_TEXTS,    /* struct fl_texts: a list, or one text */
+    FL_KIND_CHOICE,   /* int: the index among `choices` */
+    FL_KIND_DEVICE,   /* struct fl_device */
+    FL_KIND_UNSIGNED, /* uint64_t */
 };
 
 enum {
@@ -124,6 +125,7 @@ struct fl_parameter {
      .kind = _Generic(((type *)NULL)->member,                                                                          \
          bool: FL_KIND_BOOLEAN,                                                                                        \
          int64_t: FL_KIND_INTEGER,                                                                                     \
+         uint64_t: FL_KIND_UNSIGNED,                                                                                   \
          double: FL_KIND_REAL,                                                                                         \
          const char *: FL_KIND_TEXT,                                                                                   \
          struct fl_reals: FL_KIND_REALS,                                                                               \
@@ -180,12 +182,19 @@ void *fl_allocate(struct fl_block *block, size_t bytes);
 /* Says why something failed, as printf does, and returns FL_FAILED. In a step too: it only stores. */
 int fl_fail(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
+/* Says why the task has come to its end in good order: outputs go to their reset state, and it is not started again.
+ * For `return fl_end(...)` in a step; it only stores, too. */
+int fl_end(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));
+
 /* A line for the journal, from anywhere but a step. */
 void fl_log(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
 /* Add a port from `configure`. The strings must live as long as the block: constants, or fl_allocate()'s. */
 int fl_add_input(struct fl_block *block, struct fl_port port);
 int fl_add_output(struct fl_block *block, struct fl_port port);
+
+/* Whether the task file wires an input, which FL_OPTIONAL ones may be without. From `start` on. */
+bool fl_wired(const struct fl_block *block, uint32_t input);
 
 /* CLOCK_MONOTONIC in nanoseconds. */
 int64_t fl_now_ns(void);

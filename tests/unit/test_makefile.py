@@ -1,0 +1,96 @@
+"""What is given to make's variables reaches a program as it stands, and never a shell."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from images.builder import paths
+
+HOSTILE = "a b;touch {file};'\"$HOME`touch {file}`$(touch {file})"
+RECORDER = """#!{python}
+import json, sys
+with open({said!r}, "a") as file:
+    file.write(json.dumps(sys.argv[1:]) + "\\n")
+"""
+GIVEN = {
+    "image": ["ROBOT"],
+    "kernel": ["BOARD"],
+    "flash": ["ROBOT", "DEV", "FORCE"],
+    "boot": ["ROBOT"],
+    "ssh": ["ROBOT"],
+    "verify": ["ROBOT"],
+    "size": ["ROBOT"],
+    "fleet": ["N"],
+    "fleet-scale": ["N", "BOARD"],
+    "provision": ["PLAYBOOK", "ROBOT"],
+    "new-app": ["KIND", "NAME"],
+    "deploy": ["ROBOT", "APP", "RUN"],
+    "bench": ["ROBOT"],
+    "record": ["PORT", "SECONDS", "ADDRESS"],
+    "live": ["OUT", "SECONDS"],
+    "top": ["OUT", "PORT"],
+    "param": ["ROBOT", "TASK", "PARAM", "VALUE"],
+    "latency": ["BOARD", "KERNEL", "PLAN", "TARGET"],
+    "latency-accept": ["BOARD", "KERNEL", "PLAN"],
+    "boot-time": ["BOARD"],
+    "hwcheck": ["ROBOT", "SECONDS"],
+    "scenarios": ["ROBOTS", "SIDE"],
+}
+WORDS = {"provision": "ARGS", "scenarios": "FLIGHTS", "record": "OUT", "live": "PORT"}
+"""Of which each word is one of the program."""
+
+
+def make(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run make with programs that only note what they are given."""
+    programs = directory / "venv" / "bin"
+    programs.mkdir(parents=True)
+    for name in ("python", "ansible-playbook"):
+        (programs / name).write_text(RECORDER.format(python=sys.executable, said=str(directory / "said")))
+        (programs / name).chmod(0o755)
+    environment = {name: value for name, value in os.environ.items() if name not in ("BUILD", "KEYS", "MAKEFLAGS")}
+    argv = ["make", "-C", str(paths.PROJECT), "-o", "setup", "-o", "setup-tests", f"BUILD={directory}", *words]
+    return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+
+def programs_said(directory: Path) -> list[list[str]]:
+    """The words of each program that ran."""
+    return [json.loads(line) for line in (directory / "said").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("target", GIVEN)
+def test_what_is_given_is_one_word(tmp_path: Path, target: str) -> None:
+    """Seen to fail where variables stand in commands as they are: APP='x;id' ran id."""
+    file = tmp_path / "injected"
+    value = HOSTILE.format(file=file)
+    done = make(tmp_path, target, *(f"{name}={value}" for name in GIVEN[target]))
+    assert done.returncode == 0, done.stderr
+    assert not file.exists()
+    words = programs_said(tmp_path)[0]
+    assert sum(value in word for word in words) == len(GIVEN[target]), words
+
+
+@pytest.mark.parametrize("target", WORDS)
+def test_what_is_given_as_words_is_no_command(tmp_path: Path, target: str) -> None:
+    file = tmp_path / "injected"
+    done = make(tmp_path, target, f"{WORDS[target]}=--check x;touch {file} `touch {file}`")
+    assert done.returncode == 0, done.stderr
+    assert not file.exists()
+    (words,) = programs_said(tmp_path)
+    assert [word for word in words if "check" in word or "touch" in word or str(file) in word] == [
+        "--check", "x;touch", f"{file}", "`touch", f"{file}`"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["BUILD", "KEYS"])
+@pytest.mark.parametrize("value", ["a;id", "a b", "a`id`", "a'", 'a"'])
+def test_paths_that_a_shell_would_read_are_refused(name: str, value: str) -> None:
+    argv = ["make", "-C", str(paths.PROJECT), "-n", "help", f"{name}={value}"]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert f"{name}={value}: is a path with blanks or with a character that means something" in done.stderr
