@@ -94,6 +94,8 @@ def ssh_options(robot: Robot) -> list[str]:
         "HostKeyAlias": robot.name,
         "UserKnownHostsFile": str(known_hosts),
         "GlobalKnownHostsFile": "none",
+        # s: where nothing answers, not even a refusal, TCP alone would try for minutes.
+        "ConnectTimeout": "20",
     }
     # Quoted, because ssh splits the values of file options at blanks.
     return [word for name, value in settings.items() for word in ("-o", f'{name}="{value}"')]

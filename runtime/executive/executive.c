@@ -311,7 +311,7 @@ static void *guard(void *argument)
             abandon(executive, now_ns - ended_ns);
         last_ns = ended_ns;
         int64_t left_ns = until_ns > now_ns ? until_ns - now_ns : 0;
-        if (ppoll(&ended, 1, &(struct timespec){left_ns / SECOND_NS, (long)(left_ns % SECOND_NS)}, NULL) > 0)
+        if (ppoll(&ended, 1, &(struct timespec){(time_t)(left_ns / SECOND_NS), (long)(left_ns % SECOND_NS)}, NULL) > 0)
             return NULL;
     }
 }

@@ -229,10 +229,12 @@ def ssh_command(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_ssh_pins_the_host_key(build: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And ends where nothing answers: `make param` was seen to wait for 15 minutes."""
     argv = ssh_command(monkeypatch)
     assert argv[-2:] == ["10.42.0.3", "uptime"]
     assert {
         'User="robot"',
+        'ConnectTimeout="20"',
         'StrictHostKeyChecking="yes"',
         'HostKeyAlias="robot3"',
         f'UserKnownHostsFile="{build}/keys of ours/known_hosts"',
