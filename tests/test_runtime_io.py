@@ -210,6 +210,41 @@ def test_a_datagram_triggers_a_step_and_silence_does(start: Start, tmp_path: Pat
     assert counted["timeouts"] >= 2
 
 
+INTEGRATING = """
+period: 50 ms
+trigger: udp
+blocks:
+  udp: {{type: udp-receive, parameters: {{port: {port}, length: 1}}}}
+  one: {{type: constant, parameters: {{value: 1}}}}
+  integral: {{type: integrator, in: {{in: one.out}}}}
+"""
+
+
+def test_late_messages_add_no_time(start: Start) -> None:
+    """Each message comes after a step without it: two steps, of which neither is a period after the one before."""
+    port = free_port()
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        start("triggered", INTEGRATING.format(port=port), "integral.out,udp.sequence") as task,
+    ):
+        sender.connect(("127.0.0.1", port))
+        rows = task.rows()
+        before = next(rows)
+        expected, off_time = before["integral.out"], 0
+        for number in range(1, 11):
+            sender.send(b"x")
+            waiting = True
+            while waiting:
+                row = next(rows)
+                passed_ns = row["release_ns"] - before["release_ns"]
+                expected += min(max(passed_ns, 0), 500_000_000) / 1e9
+                off_time += passed_ns != 50_000_000
+                assert row["integral.out"] == pytest.approx(expected, abs=1e-9)
+                waiting = row["udp.sequence"] < number or before["udp.sequence"] < number
+                before = row
+        assert off_time >= 10
+
+
 def test_a_port_is_for_one(start: Start, refusal: Callable[..., tuple[int, str]]) -> None:
     port = free_port()
     with start("receiver", RECEIVER.format(port=port, length=4), RECEIVED) as receiver:
