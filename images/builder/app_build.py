@@ -31,8 +31,11 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
                 with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".ert-") as work:
                     source = Path(work) / "source"
                     model, times_s = description.model, description.sample_times
-                    app_ert.block(subject.directory, model, subject.name, times_s, source)
-                    _blocks(subject, source, ("-Wall",), board.architecture, out, run)
+                    app_ert.block(subject.directory, model, subject.name, times_s, source, board.architecture)
+                    try:
+                        _blocks(subject, source, ("-Wall",), board.architecture, out, run)
+                    except UserError as error:
+                        raise app_ert.explained(error, board.architecture) from None
             elif isinstance(description, app.Fmu):
                 _fmu(subject, description, board.architecture, out, run)
             else:
