@@ -63,8 +63,13 @@ def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def build(shape: Shape, work: Path) -> Path:
     """The directory of the plug-in."""
-    out, blocks = work / "source", work / "blocks"
     write(shape, work / "app" / app_ert.GENERATED)
+    return compiled(shape, work)
+
+
+def compiled(shape: Shape, work: Path) -> Path:
+    """The same, of code that was written."""
+    out, blocks = work / "source", work / "blocks"
     app_ert.block(work / "app", shape.model, "model", [], out, "amd64")
     blocks.mkdir()
     options = [
@@ -167,11 +172,38 @@ def test_a_shape_that_cannot_be_a_block_is_refused_with_the_reason(work: Path, n
     assert said in str(refused.value)
 
 
+@pytest.mark.parametrize("name", ["r2024a", "r2014a-nested"])
+def test_a_model_that_reports_an_error_ends_the_task(flotilla_run: Path, work: Path, name: str) -> None:
+    shape = SHAPES[name]
+    write(shape, work / "app" / app_ert.GENERATED)
+    source = work / "app" / app_ert.GENERATED / "plant.c"
+    text = source.read_text()
+    failing = text.replace(
+        "  /* Outport: '<Root>/count' */", '  if (count_of_steps++ == 3) plant_M->errorStatus = "lost";'
+    )
+    assert failing != text
+    source.write_text(f"static int count_of_steps;\n{failing}")
+    done = run(flotilla_run, compiled(shape, work), TASK.format(written("plain")), "plain.command")
+    assert (done.returncode, "plain: lost" in done.stderr) == (1, True), done.stderr
+    assert len(done.stdout.splitlines()) == 3
+
+
+def test_types_of_another_size_than_their_names_say_are_refused(work: Path) -> None:
+    """As generated for another processor, without the coder's own check."""
+    write(SHAPES["r2024a"], work / "app" / app_ert.GENERATED)
+    types = work / "app" / app_ert.GENERATED / "rtwtypes.h"
+    types.write_text(types.read_text().replace("unsigned int uint32_T", "unsigned long uint32_T"))
+    with pytest.raises(
+        AssertionError, match="count is no uint32 here: generate the model for the processor of the robot"
+    ):
+        compiled(SHAPES["r2024a"], work)
+
+
 @pytest.mark.parametrize(("word_size", "accepted"), [("32", "i386"), ("64", "amd64")])
 def test_word_sizes_are_the_robots(fleet: Fleet, tmp_path: Path, word_size: str, accepted: str) -> None:
     """By the locked compilers: the coder's own check of word sizes is made, and judges the robot's processor."""
     directory = tmp_path / "model"
-    write(Shape("any", word_size=word_size), directory / app_ert.GENERATED)
+    write(Shape("any", reusable=True, word_size=word_size), directory / app_ert.GENERATED)
     (directory / app.FILE).write_text("kind: ert\nmodel: plant\n")
     (directory / app.TASK).write_text(TASK.format(written("plain", OWN)).replace("priority: 0", "priority: 70"))
     boards = {str(board.architecture): board for board in fleet.boards.values()}
