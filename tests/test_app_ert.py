@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +23,10 @@ def generated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The sample's code, model `sample`, with this computer's compiler in place of the locked one."""
 
     def command(work: Path, _: str, argv: Sequence[str], *_run: object) -> None:
-        subprocess.run([word.replace("/out", str(work)) for word in argv], check=True)
+        argv = [word.replace("/out", str(work)) for word in argv]
+        done = subprocess.run(argv, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise UserError(done.stderr)
 
     monkeypatch.setattr(runtime, "command", command)
     monkeypatch.setattr(paths, "BUILD", tmp_path)
@@ -37,8 +41,9 @@ def change(file: Path, old: str, new: str) -> None:
 
 
 def read(generated: Path, times_s: list[float] | None = None) -> app_ert.Model:
-    text = app_ert.preprocess(generated, "sample")
-    return app_ert.read("sample", text, (generated / "sample.c").read_text(), times_s or [])
+    out = generated.parent / "read"
+    code = app_ert.collect(generated, "sample", out)
+    return app_ert.read("sample", app_ert.preprocess(out, "sample", code, "amd64"), code, times_s or [])
 
 
 def test_ports_parameters_and_rates_are_the_models(generated: Path) -> None:
@@ -75,30 +80,46 @@ extern void sample_step(RT_MODEL_sample_T *const sample_M);
     model = read(generated)
     assert [(s.name, s.type, s.width) for s in model.inputs] == [("In1", "single", 3)]
     assert [(s.name, s.type, s.width) for s in model.outputs] == [("Out1", "int16", 1)]
-    assert model.packed == {"inputs": "ExtU", "outputs": "ExtY"}
+    assert model.packed == {"inputs": "inputs", "outputs": "outputs"}
     assert [step.arguments for step in model.steps] == ["&instance->model"]
     assert (model.period_s, model.terminate, model.parameters) == (None, None, [])
     assert "sample_step(&instance->model);" in app_ert.render(model, "sample")
 
 
+STEP1 = "extern void sample_step1(RT_MODEL_sample_T *const sample_M, "
+RTM = "DW_sample_T *dwork;"
 REFUSED = {
-    "not reusable": ("sample*.h", "RT_MODEL_", "OTHER_", "has no RT_MODEL_sample…: generate it with reusable"),
-    "global data": (
+    "exported functions": ("sample.h", "sample_step", "sample_tick", "has no function sample_step (it has: sample_in"),
+    "a direction": ("sample.h", STEP1, f"{STEP1}real_T *arg_speed, ", "whether the argument arg_speed is an input"),
+    "a bus": ("sample.h", "real_T error; ", "struct { real_T a; } error; ", "has a root port error of type struct"),
+    "a bus by pointer": (
         "sample.h",
-        "extern void sample_step1(RT_MODEL_sample_T *const sample_M, ",
-        "extern void sample_step1(",
-        "has a sample_step1 that is given no model; generate it with reusable functions",
+        STEP1,
+        f"{STEP1}struct bus *sample_U_bus, ",
+        "has a root port sample_U_bus of type bus; root",
     ),
-    "separate arguments": (
+    "an allocation": (
         "sample.h",
-        "extern void sample_step1(RT_MODEL_sample_T *const sample_M, ",
-        "extern void sample_step1(RT_MODEL_sample_T *const sample_M, real_T arg_speed, ",
-        "has a sample_step1 with a parameter arg_speed, whose type is no structure; pass root-level I/O as",
+        STEP1,
+        f"extern RT_MODEL_sample_T *sample(void);\n{STEP1}",
+        "allocates its structures",
     ),
-    "a bus": ("sample.h", "real_T error; ", "struct { real_T a; } error; ", "has a root port error of another kind"),
+    "a pointer": (
+        "sample.h",
+        RTM,
+        f"{RTM} void *updates;",
+        "uses updates of its real-time model, a pointer that nothing",
+    ),
+    "no values": (
+        "sample_data.c",
+        "P_sample_T sample_P = {",
+        "double other[] = {",
+        "nothing here has their values; sample_",
+    ),
     "no rates": ("sample.c", "[0.05s, 0.0s] */\n{", "*/\n{", "has 2 step functions, and 1 sample times are known"),
     "no multiple": ("sample.c", "[0.05s, 0.0s] */\n{", "[0.035s, 0.0s] */\n{", "a step1 each 0.035 s, which is no"),
-    "no C": ("sample.h", "typedef struct {", "class sample {", "sample.h: sample.h:"),
+    "C++": ("sample.h", "typedef struct {", "class sample {", "generated/sample is C++, and the locked compiler for"),
+    "no C": ("sample.h", "typedef struct {", "typedef strukt {", "sample.h: sample.h:"),
 }
 
 
@@ -111,6 +132,40 @@ def test_what_cannot_become_a_block_is_said(generated: Path, file: str, old: str
     assert said in str(refused.value)
 
 
+def test_a_header_that_is_missing_is_named(generated: Path) -> None:
+    """The coder leaves it in a folder of files that models share."""
+    (generated / "rtwtypes.h").unlink()
+    said = (
+        r"generated/ lacks rtwtypes\.h: it is part of the generated code, as files in slprj/ert/_sharedutils are; let"
+    )
+    with pytest.raises(UserError, match=said):
+        read(generated)
+
+
+def test_two_files_of_one_name_are_refused_unless_they_are_the_same(generated: Path) -> None:
+    shared = generated / "slprj" / "rtwtypes.h"
+    shared.parent.mkdir()
+    shared.write_text((generated / "rtwtypes.h").read_text())
+    assert read(generated).steps
+    shutil.rmtree(generated.parent / "read")
+    shared.write_text("")
+    with pytest.raises(
+        UserError, match=r"generated/: two files are named rtwtypes\.h, and differ; leave the model's own"
+    ):
+        read(generated)
+
+
+def test_the_period_of_a_single_rate_is_that_of_the_coders_main_program(generated: Path) -> None:
+    for old, new in (("_step0", "_step"), ("_step1", "_other")):
+        for name in ("sample.h", "sample.c"):
+            change(generated / name, f"sample{old}", f"sample{new}")
+    said = "* period 0.02 seconds (base rate of the model) here.\n"
+    (generated / "ert_main.c").write_text(
+        f"/* Attach rt_OneStep to a timer or interrupt service routine with\n {said} */"
+    )
+    assert read(generated).period_s == 0.02
+
+
 def test_rates_that_the_code_does_not_tell(generated: Path) -> None:
     change(generated / "sample.c", "Sample time:", "Time:")
     assert [step.every for step in read(generated, [0.002, 0.006]).steps] == [1, 3]
@@ -118,13 +173,13 @@ def test_rates_that_the_code_does_not_tell(generated: Path) -> None:
 
 def test_files_that_are_missing(generated: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"generated/other\.h is missing; generated/ holds what Embedded Coder made"):
-        app_ert.block(generated.parent, "other", "sample", [], tmp_path / "out")
+        app_ert.block(generated.parent, "other", "sample", [], tmp_path / "out", "amd64")
 
 
 def run(flotilla_run: Path, generated: Path, task: str, steps: int, watch: str) -> list[dict[str, float]]:
     """The values of signals in each step of a task that uses the block `sample`."""
     out = generated.parent / "source"
-    app_ert.block(generated.parent, "sample", "sample", [], out)
+    app_ert.block(generated.parent, "sample", "sample", [], out, "amd64")
     (generated.parent / "blocks").mkdir()
     warnings = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-O2"]
     argv = ["cc", *warnings, "-shared", "-fPIC", f"-I{paths.PROJECT / 'runtime' / 'include'}", "-o"]
@@ -197,7 +252,7 @@ MAIN = """\
 
 
 def test_a_model_of_one_rate_is_held_to_the_period_that_its_main_program_says(
-    flotilla_run: Path, generated: Path
+    flotilla_run: Path, generated: Path, tmp_path: Path
 ) -> None:
     """Seen to fail where only step functions with numbers say their rates: the model ran at twice its rate."""
     for file in (generated / "sample.h", generated / "sample.c"):
@@ -206,4 +261,5 @@ def test_a_model_of_one_rate_is_held_to_the_period_that_its_main_program_says(
     (generated / "ert_main.c").write_text(MAIN)
     with pytest.raises(AssertionError, match=r"generated for a period of 20\.0 ms, and runs each 10 ms"):
         run(flotilla_run, generated, TASK, 1, "plain.command")
-    assert app_ert.read("sample", app_ert.preprocess(generated, "sample"), MAIN, [0.01]).period_s == 0.01
+    code = app_ert.collect(generated, "sample", out := tmp_path / "collected")
+    assert app_ert.read("sample", app_ert.preprocess(out, "sample", code, "amd64"), code, [0.01]).period_s == 0.01

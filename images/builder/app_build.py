@@ -18,7 +18,7 @@ _BUILT = ("*.o", "*.d", ".git")
 def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolchain.run) -> None:
     """Fill `out` with what goes to a robot of `board`; UserError with the compiler's or the runtime's own words.
 
-    `run` says where the robot's code is compiled; what this computer needs to check it is always compiled here.
+    `run` says where the robot's code is compiled.
     """
     paths.BUILD.mkdir(parents=True, exist_ok=True)
     with cache.exclusive(), progress.step(f"{subject.name} for {board.architecture}"):
@@ -31,8 +31,11 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
                 with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".ert-") as work:
                     source = Path(work) / "source"
                     model, times_s = description.model, description.sample_times
-                    app_ert.block(subject.directory, model, subject.name, times_s, source)
-                    _blocks(subject, source, ("-Wall",), board.architecture, out, run)
+                    app_ert.block(subject.directory, model, subject.name, times_s, source, board.architecture)
+                    try:
+                        _blocks(subject, source, ("-Wall",), board.architecture, out, run)
+                    except UserError as error:
+                        raise app_ert.explained(error, board.architecture) from None
             elif isinstance(description, app.Fmu):
                 _fmu(subject, description, board.architecture, out, run)
             else:
@@ -51,11 +54,9 @@ def _blocks(
         if any(source.glob("*.c")):
             plugin = runtime.compile_plugin(source, architecture, options, run)
             (out / "blocks" / f"{subject.name}.so").write_bytes(plugin)
-            if architecture != "amd64":
-                plugin = runtime.compile_plugin(source, "amd64", options)
             (Path(directory) / f"{subject.name}.so").write_bytes(plugin)
-            runtime.check_plugins(Path(directory))
-        runtime.check_task(task, task.read_bytes(), Path(directory))
+            runtime.check_plugins(Path(directory), architecture)
+        runtime.check_task(task, task.read_bytes(), Path(directory), architecture)
     shutil.copyfile(task, out / app.TASK)
 
 

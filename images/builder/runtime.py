@@ -19,6 +19,11 @@ LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libsystemd0", "libyaml-
 """Packages whose libraries its programs load; robots have them from images/packages/robot.list."""
 WARNINGS = ("-Wall", "-Wextra", "-Werror")
 """Compiler options for code that is written by hand."""
+_LOADERS = {
+    "amd64": ("lib64/ld-linux-x86-64.so.2", "usr/lib/x86_64-linux-gnu"),
+    "i386": ("lib/ld-linux.so.2", "usr/lib/i386-linux-gnu"),
+}
+"""The dynamic loader and the libraries in a tree of an architecture. A 64-bit PC runs programs for both."""
 _LEFT_OUT = ("bench", "station", "tests")
 """Folders of the source that no package comes from."""
 
@@ -79,30 +84,35 @@ def compile_shared(
         return (work / "plugin.so").read_bytes()
 
 
-def check_plugins(directory: Path) -> None:
-    """Let the runtime judge plug-ins for amd64: the interface that they were made for, names that are taken."""
-    done = _run("flotilla-blocks", "--blocks", str(directory))
+def check_plugins(directory: Path, architecture: str) -> None:
+    """Let the runtime judge plug-ins: the interface that they were made for, names that are taken.
+
+    It runs on this computer as a robot of the plug-ins' `architecture` has it; so does it below.
+    """
+    done = _run(architecture, "flotilla-blocks", "--blocks", str(directory))
     if done.returncode:
         raise UserError(done.stderr.replace(f"{directory}/", "").strip())
 
 
-def check_task(path: Path, content: bytes, plugins: Path | None = None) -> None:
+def check_task(path: Path, content: bytes, plugins: Path | None = None, architecture: str = "amd64") -> None:
     """Let the runtime judge a task as the robot would; UserError with all that is wrong in `path`.
 
-    `plugins`: a directory with blocks that the runtime lacks, for amd64.
+    `plugins`: a directory with blocks that the runtime lacks, for `architecture`.
     """
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".task-") as directory:
         file = Path(directory) / path.name
         file.write_bytes(content)
-        directories = ":".join(str(each) for each in (plugins, _programs() / "usr/lib/flotilla/blocks") if each)
-        done = _run("flotilla-run", "--check", "--blocks", directories, str(file))
+        directories = ":".join(
+            str(each) for each in (plugins, _programs(architecture) / "usr/lib/flotilla/blocks") if each
+        )
+        done = _run(architecture, "flotilla-run", "--check", "--blocks", directories, str(file))
         if done.returncode:
             raise UserError(done.stderr.replace(str(file), paths.shown(path)).strip())
 
 
-def _programs() -> Path:
-    """The runtime for amd64, unpacked."""
-    made = build("amd64")
+def _programs(architecture: str) -> Path:
+    """The runtime, unpacked."""
+    made = build(architecture)
 
     def unpack(out: Path) -> None:
         subprocess.run(["dpkg-deb", "-x", str(made.package), str(out)], check=True)
@@ -110,11 +120,12 @@ def _programs() -> Path:
     return cache.result("runtime-programs", made.directory.name.removeprefix("runtime-"), unpack)
 
 
-def _run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def _run(architecture: str, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a program of the runtime on this computer, whatever libraries that has."""
-    tree = tools.tree(read_lock("runtime-amd64"))
-    argv = [str(tree / "lib64/ld-linux-x86-64.so.2"), "--library-path", str(tree / "usr/lib/x86_64-linux-gnu")]
-    argv += [str(_programs() / "usr/bin" / program), *arguments]
+    tree = tools.tree(read_lock(f"runtime-{architecture}"))
+    loader, libraries = _LOADERS[architecture]
+    argv = [str(tree / loader), "--library-path", str(tree / libraries)]
+    argv += [str(_programs(architecture) / "usr/bin" / program), *arguments]
     return subprocess.run(argv, capture_output=True, encoding="utf-8", check=False)
 
 
