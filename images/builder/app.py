@@ -48,6 +48,8 @@ class Make(_Description):
     """What it makes, relative to the app."""
     arguments: list[str] = []
     """What the program is called with."""
+    files: list[Inside] | None = None
+    """What else goes to the robot, to the same places: files and directories of the app, made by make or not."""
     notify: bool = False
     """The program speaks sd_notify(3): it says when it is ready, and is ended when it has not said WATCHDOG=1 for a
     second."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -13,6 +14,11 @@ from images.builder.fleet import Board
 
 _BUILT = ("*.o", "*.d", ".git")
 """What a copy of a project leaves out: what its own build left behind may be for another processor."""
+_NO_DATA = re.compile(
+    r"[^.]*|\..*|.*\.(c|h|cc|cpp|cxx|hh|hpp|hxx|inc|s|S|asm|o|d|a|mk|am|ac|in|cmake|py|sh|md|rst)"
+    r"|(app|safe)\.yml|(CMakeLists|README|LICENSE)\.txt"
+)
+"""Names of what a project consists of and its program does without, if nobody says otherwise."""
 
 
 def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolchain.run) -> None:
@@ -90,7 +96,43 @@ def _make(subject: app.App, description: app.Make, architecture: str, out: Path,
         program = out / made.name
         shutil.copyfile(made, program)
         program.chmod(0o755)
+        _send_along(subject, description, source, out)
     (out / "unit.d" / "program.conf").write_text(service(subject, description, safe=safe.exists()))
+
+
+def _send_along(subject: app.App, description: app.Make, source: Path, out: Path) -> None:
+    """What the program needs beside it; UserError where that may be left here without a word."""
+    where = paths.shown(subject.directory / app.FILE)
+    for name in description.files or []:
+        sent, taken = source / name, out / name
+        if not sent.exists():
+            raise UserError(f"{where}: files: {name}: is not there, and make does not make it; name what there is")
+        if taken.exists():
+            raise UserError(f"{where}: files: {name}: is sent anyhow; leave it out, or give it another name")
+        if any(path.is_symlink() and not path.resolve().is_relative_to(source.resolve()) for path in _below(sent)):
+            raise UserError(f"{where}: files: {name}: has a link to outside the app; put a copy in its place")
+        taken.parent.mkdir(parents=True, exist_ok=True)
+        if sent.is_dir():
+            shutil.copytree(sent, taken)
+        else:
+            shutil.copy(sent, taken)
+    if description.files is None and (left := _left(subject, description, source)):
+        listed = ", ".join(left[:5]) + (", …" if len(left) > 5 else "")
+        remedy = f"write files: [{left[0]}] for what the program needs there, files: [] for nothing"
+        raise UserError(f"{where}: files: (nothing): would leave {listed} here; {remedy}")
+
+
+def _left(subject: app.App, description: app.Make, source: Path) -> list[str]:
+    """What the program may need, and does not get: data of the project, and libraries that make made."""
+    data = {path.relative_to(subject.directory) for path in _below(subject.directory) if path.is_file()}
+    hidden = {path for path in data if any(part.startswith(".") for part in path.parts)}
+    data = {path for path in data - hidden if not _NO_DATA.fullmatch(path.name)}
+    libraries = {path.relative_to(source) for path in _below(source) if ".so" in path.suffixes}
+    return sorted(str(path) for path in (data | libraries) - {Path(description.program)})
+
+
+def _below(path: Path) -> list[Path]:
+    return [path, *path.rglob("*")]
 
 
 def service(subject: app.App, description: app.Make, *, safe: bool) -> str:

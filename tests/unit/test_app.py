@@ -6,12 +6,14 @@ Building one and running it is tested on a guest, in tests/test_deploy.py.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from images.builder import app, app_build, app_deploy, app_new, app_robot, paths
+from images.builder import app, app_build, app_deploy, app_new, app_robot, paths, runtime
 from images.builder.errors import UserError
 from images.builder.fleet import Board, Robot
 
@@ -111,6 +113,81 @@ def test_a_programs_service(tmp_path: Path) -> None:
     watched = app_build.service(made, made.description.model_copy(update={"notify": True}), safe=False)
     assert "WatchdogSec" not in watched
     assert "--safe" not in watched
+
+
+PROJECT = {
+    "Makefile": """hover: main.c lib/libown.so
+\t$(CC) -o $@ main.c -Llib -lown -Wl,-rpath,'$$ORIGIN/lib'
+lib/libown.so: own.c
+\tmkdir -p lib && $(CC) -shared -fPIC -o $@ own.c
+""",
+    "own.c": "int own(void) { return 7; }\n",
+    "main.c": """#include <stdio.h>
+int own(void);
+int main(void)
+{
+    char word[9] = "";
+    FILE *data = fopen("data/gains.csv", "r");
+    return !(data && fscanf(data, "%8s", word) == 1 && printf("%d %s\\n", own(), word) > 0);
+}
+""",
+    "data/gains.csv": "2.5\n",
+    "README.md": "",
+}
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An app of kind make with data and a library of its own, with this computer's compiler for the locked one."""
+
+    def command(work: Path, _: str, argv: Sequence[str], *_run: object) -> None:
+        subprocess.run([word.replace("/out", str(work)) for word in argv], check=True, capture_output=True)
+
+    monkeypatch.setattr(runtime, "command", command)
+    monkeypatch.setattr(paths, "BUILD", tmp_path / "build")
+    for name, text in PROJECT.items():
+        (tmp_path / "hover" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "hover" / name).write_text(text)
+    return tmp_path / "hover"
+
+
+def built(project: Path, keys: str) -> Path:
+    """What goes to the robot, with further keys of app.yml."""
+    (project / "app.yml").write_text(f"kind: make\nprogram: hover\n{keys}")
+    out = project.with_name("out")
+    shutil.rmtree(out, ignore_errors=True)
+    app_build.build(app.load(project), Board.model_construct(name="pc", architecture="amd64"), out)
+    return out
+
+
+def test_a_program_gets_its_data_and_libraries(project: Path) -> None:
+    """Seen to fail where the program alone was sent: the robot said that it lacks libown.so."""
+    out = built(project, "files: [data/gains.csv, lib]\n")
+    done = subprocess.run([out / "hover"], cwd=out, capture_output=True, text=True, check=True)
+    assert done.stdout == "7 2.5\n"
+    assert not (out / "main.c").exists()
+
+
+FILES = {
+    "nothing is said": ("", "files: (nothing): would leave data/gains.csv, lib/libown.so here; write files: [data/gai"),
+    "not there": ("files: [date]\n", "files: date: is not there, and make does not make it; name what there is"),
+    "outside": ("files: [../x]\n", "files.0: ../x: is not a file inside the app"),
+    "the program": ("files: [hover]\n", "files: hover: is sent anyhow; leave it out, or give it another name"),
+    "a link": ("files: [there]\n", "files: there: has a link to outside the app; put a copy in its place"),
+}
+
+
+@pytest.mark.parametrize(("keys", "said"), FILES.values(), ids=FILES.keys())
+def test_what_would_be_left_or_lost_is_refused(project: Path, keys: str, said: str) -> None:
+    """Seen to fail where a program was sent without its data, and nobody said so."""
+    (project / "there").symlink_to("/etc/hostname")
+    with pytest.raises(UserError) as refused:
+        built(project, keys)
+    assert f"hover/app.yml: {said}" in str(refused.value)
+
+
+def test_what_may_stay_here_stays(project: Path) -> None:
+    assert not (built(project, "files: []\n") / "data").exists()
 
 
 TIMES = {"count": 100, "min_ns": 1000, "mean_ns": 2500, "p99_ns": 80000, "max_ns": 91250}
