@@ -107,7 +107,7 @@ static pid_t wait_for_holder(const struct sockaddr_un *address, socklen_t length
     int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
     if (fd >= 0 && connect(fd, (const struct sockaddr *)address, length) == 0) {
         getsockopt(fd, SOL_SOCKET, SO_PEERCRED, &holder, &size);
-        int64_t left_ms = (until_ns - fl_now_ns()) / 1000000;
+        int64_t left_ms = (until_ns - fl_now_ns()) / 1000000 + 1; /* each turn takes one of the holder's places */
         struct pollfd gone = {.fd = fd};
         poll(&gone, 1, left_ms > 0 ? (int)left_ms : 0);
     } else {
@@ -130,8 +130,11 @@ static int refuse(struct fl_block *block, pid_t process)
         if (!command[i])
             command[i] = ' ';
     char *device = text_of(block, write_shown);
-    fl_fail(block, "%s is held by process %d (%s); a device serves one task, end that first", device, (int)process,
-            command);
+    if (process)
+        fl_fail(block, "%s is held by process %d (%s); a device serves one task, end that first", device, (int)process,
+                command);
+    else /* so many have asked for it, or it belongs to a container */
+        fl_fail(block, "%s is held by another process; a device serves one task, end that first", device);
     free(device);
     return FL_FAILED;
 }
