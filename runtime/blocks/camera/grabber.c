@@ -24,12 +24,19 @@ int grabber_start(struct fl_block *block, struct grabber *grabber, int64_t width
                   void (*run)(struct fl_driver *driver, void *grabber))
 {
     grabber->parameters = block->parameters;
+    grabber->block = block;
     grabber->bytes = (size_t)(width * height);
     fl_sensor_begin(&grabber->sensor);
     if (frames_allocate(block, &grabber->frames, grabber->bytes) != FL_OK)
         return FL_FAILED;
     grabber->driver = fl_driver_start(block, run, grabber);
     return grabber->driver ? FL_OK : FL_FAILED;
+}
+
+void grabber_publish(struct grabber *grabber, int64_t at_ns)
+{
+    frames_publish(&grabber->frames, at_ns);
+    fl_reasons_good(&grabber->reasons, fl_now_ns());
 }
 
 void grabber_step(struct fl_block *block, struct grabber *grabber, double timeout)

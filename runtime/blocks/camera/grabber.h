@@ -31,7 +31,15 @@ struct grabber {
     size_t bytes;
     _Atomic bool connected; /* the thread's: the camera streams */
     struct fl_sensor sensor;
+    struct fl_block *block; /* the thread's, to tell why there are no images */
+    struct fl_reasons reasons;
 };
+
+/* Log why there are no images, once (fl_reasons_tell). For the thread. */
+#define GRABBER_TELL(grabber, ...) fl_reasons_tell(&(grabber)->reasons, (grabber)->block, fl_now_ns(), __VA_ARGS__)
+
+/* Hand over the frame that frames_back() gave, and that the camera is good. For the thread. */
+void grabber_publish(struct grabber *grabber, int64_t at_ns);
 
 /* Add the outputs image, flag, age and sequence. */
 int grabber_configure(struct fl_block *block, int64_t width, int64_t height);

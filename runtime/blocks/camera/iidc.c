@@ -101,16 +101,24 @@ static void close_session(struct session *session)
 }
 
 /* The library looks for the bus when it is begun, so it is begun anew each time. */
-static bool open_session(struct session *session, const struct iidc *set)
+static bool open_session(struct session *session, struct grabber *grabber)
 {
+    const struct iidc *set = grabber->parameters;
     session->library = dc1394_new();
     session->camera = session->library ? find(session->library, set->guid) : NULL;
-    if (session->camera && dc1394_video_set_iso_speed(session->camera, DC1394_ISO_SPEED_400) == DC1394_SUCCESS &&
-        set_size(session->camera, set)) {
+    if (!session->camera) {
+        GRABBER_TELL(grabber, "no camera %s%son the FireWire bus; trying on", set->guid, *set->guid ? " " : "");
+    } else if (dc1394_video_set_iso_speed(session->camera, DC1394_ISO_SPEED_400) != DC1394_SUCCESS ||
+               !set_size(session->camera, set)) {
+        GRABBER_TELL(grabber,
+                     "the camera has no images of %d x %d pixels in shades of grey: set width, height and rate",
+                     (int)set->width, (int)set->height);
+    } else {
         set_shutter(session->camera, set->shutter);
         if (dc1394_capture_setup(session->camera, BUFFERS, DC1394_CAPTURE_FLAGS_DEFAULT) == DC1394_SUCCESS &&
             dc1394_video_set_transmission(session->camera, DC1394_ON) == DC1394_SUCCESS)
             return true;
+        GRABBER_TELL(grabber, "the camera does not start: is another program or robot using it?");
     }
     close_session(session);
     return false;
@@ -147,7 +155,9 @@ static bool take(dc1394camera_t *camera, struct grabber *grabber)
         uint8_t *to = frames_back(&grabber->frames);
         for (size_t row = 0; row < frame->size[1]; row++)
             memcpy(to + row * frame->size[0], frame->image + row * frame->stride, frame->size[0]);
-        frames_publish(&grabber->frames, taken_ns(frame));
+        grabber_publish(grabber, taken_ns(frame));
+    } else {
+        GRABBER_TELL(grabber, "an image is damaged, or of another size: check the cable");
     }
     return dc1394_capture_enqueue(camera, frame) == DC1394_SUCCESS;
 }
@@ -157,13 +167,18 @@ static void run(struct fl_driver *driver, void *context)
     struct grabber *grabber = context;
     struct session session = {0};
     do {
-        if (!open_session(&session, grabber->parameters))
+        if (!open_session(&session, grabber))
             continue;
         atomic_store(&grabber->connected, true);
         int fd = dc1394_capture_get_fileno(session.camera);
-        while (fl_driver_wait(driver, fd, false, SILENCE_MS) == 1 && take(session.camera, grabber))
+        int ready;
+        while ((ready = fl_driver_wait(driver, fd, false, SILENCE_MS)) == 1 && take(session.camera, grabber))
             ;
         atomic_store(&grabber->connected, false);
+        if (ready == 0)
+            GRABBER_TELL(grabber, "no image for %d ms; beginning anew", SILENCE_MS);
+        else if (ready != -1)
+            GRABBER_TELL(grabber, "the camera is gone; trying on");
         close_session(&session);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);
 }

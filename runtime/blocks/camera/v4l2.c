@@ -7,6 +7,7 @@
 #include <linux/videodev2.h>
 #include <math.h>
 #include <stdatomic.h>
+#include <stdio.h>
 #include <string.h>
 #include <sys/ioctl.h>
 #include <sys/mman.h>
@@ -29,10 +30,22 @@ static const struct fl_parameter parameters[] = {
                  .summary = "time of exposure; 0 leaves it to the camera"),
 };
 
+/* Formats that have the brightness as it is, in eight bits, best first: all of it is in the first plane, a byte every
+ * `pitch`. Compressed ones (MJPG, H264) would need a library. */
+static const struct format {
+    uint32_t code;
+    uint8_t pitch, first;
+} formats[] = {
+    {V4L2_PIX_FMT_GREY, 1, 0},   {V4L2_PIX_FMT_NV12, 1, 0},   {V4L2_PIX_FMT_NV21, 1, 0}, {V4L2_PIX_FMT_NV16, 1, 0},
+    {V4L2_PIX_FMT_YUV420, 1, 0}, {V4L2_PIX_FMT_YVU420, 1, 0}, {V4L2_PIX_FMT_YUYV, 2, 0}, {V4L2_PIX_FMT_YVYU, 2, 0},
+    {V4L2_PIX_FMT_UYVY, 2, 1},   {V4L2_PIX_FMT_VYUY, 2, 1},   {V4L2_PIX_FMT_Y16, 2, 1}, /* least byte first */
+};
+enum { FORMATS = sizeof formats / sizeof formats[0] };
+
 /* A camera that is open, and how its frames lie in memory. */
 struct stream {
     int fd;
-    uint32_t format; /* V4L2_PIX_FMT_GREY or V4L2_PIX_FMT_YUYV */
+    const struct format *format;
     size_t width, height, stride;
     size_t count;
     struct {
@@ -50,21 +63,71 @@ static bool request(int fd, unsigned long code, void *argument)
     return result == 0;
 }
 
-static bool choose_format(struct stream *stream, uint32_t format)
+static bool choose_format(struct stream *stream, const struct format *format, struct v4l2_pix_format *given)
 {
     struct v4l2_format asked = {.type = V4L2_BUF_TYPE_VIDEO_CAPTURE};
     asked.fmt.pix = (struct v4l2_pix_format){.width = (uint32_t)stream->width,
                                              .height = (uint32_t)stream->height,
-                                             .pixelformat = format,
+                                             .pixelformat = format->code,
                                              .field = V4L2_FIELD_NONE};
     /* A driver answers with what it will do, which need not be what it was asked for. */
-    if (!request(stream->fd, VIDIOC_S_FMT, &asked) || asked.fmt.pix.pixelformat != format ||
-        asked.fmt.pix.width != stream->width || asked.fmt.pix.height != stream->height)
+    if (!request(stream->fd, VIDIOC_S_FMT, &asked) || asked.fmt.pix.pixelformat != format->code)
         return false;
-    size_t row = stream->width * (format == V4L2_PIX_FMT_YUYV ? 2 : 1);
+    *given = asked.fmt.pix;
+    size_t row = stream->width * format->pitch;
     stream->format = format;
     stream->stride = asked.fmt.pix.bytesperline ? asked.fmt.pix.bytesperline : row;
-    return stream->stride >= row;
+    return given->width == stream->width && given->height == stream->height && stream->stride >= row;
+}
+
+/* The codes of formats, as Linux writes them, in a line. */
+struct codes {
+    char text[96];
+};
+
+static void append(struct codes *codes, uint32_t code)
+{
+    size_t length = strlen(codes->text);
+    snprintf(codes->text + length, sizeof codes->text - length, "%s%c%c%c%c", length ? " " : "", (char)(code & 0x7F),
+             (char)(code >> 8 & 0x7F), (char)(code >> 16 & 0x7F), (char)(code >> 24 & 0x7F));
+}
+
+static void tell_formats(struct grabber *grabber, const struct stream *stream, const char *path)
+{
+    struct codes usable = {""}, offered = {""};
+    struct v4l2_fmtdesc described = {.type = V4L2_BUF_TYPE_VIDEO_CAPTURE};
+    for (size_t i = 0; i < FORMATS; i++)
+        append(&usable, formats[i].code);
+    for (; described.index < 16 && request(stream->fd, VIDIOC_ENUM_FMT, &described); described.index++)
+        append(&offered, described.pixelformat);
+    GRABBER_TELL(grabber, "%s offers %s, of which none is read: take a camera with one of %s", path,
+                 *offered.text ? offered.text : "no format", usable.text);
+}
+
+/* The first of the formats that the camera has in the size that is wanted; false after it was told that there is none.
+ */
+static bool choose(struct grabber *grabber, struct stream *stream, const char *path)
+{
+    struct v4l2_pix_format given = {0};
+    for (size_t i = 0; i < FORMATS; i++)
+        if (choose_format(stream, &formats[i], &given))
+            return true;
+    if (given.width)
+        GRABBER_TELL(grabber, "%s has images of %u x %u pixels, not of %zu x %zu: set width and height", path,
+                     given.width, given.height, stream->width, stream->height);
+    else
+        tell_formats(grabber, stream, path);
+    return false;
+}
+
+/* Many a USB camera has a second device, for metadata. */
+static bool is_camera(int fd)
+{
+    struct v4l2_capability able = {0};
+    if (!request(fd, VIDIOC_QUERYCAP, &able))
+        return false;
+    uint32_t here = able.capabilities & V4L2_CAP_DEVICE_CAPS ? able.device_caps : able.capabilities;
+    return here & V4L2_CAP_VIDEO_CAPTURE && here & V4L2_CAP_STREAMING;
 }
 
 /* What a camera does not offer it keeps as it is: a wish, other than the size. */
@@ -117,18 +180,24 @@ static void close_stream(struct stream *stream)
     close(stream->fd); /* ends the streaming too */
 }
 
-static bool open_stream(struct stream *stream, const struct v4l2 *set)
+static bool open_stream(struct stream *stream, struct grabber *grabber)
 {
+    const struct v4l2 *set = grabber->parameters;
+    const char *path = set->device.path;
     int type = V4L2_BUF_TYPE_VIDEO_CAPTURE;
-    *stream = (struct stream){.fd = open(set->device.path, O_RDWR | O_NONBLOCK | O_CLOEXEC),
-                              .width = (size_t)set->width,
-                              .height = (size_t)set->height};
-    if (stream->fd < 0)
+    *stream = (struct stream){
+        .fd = open(path, O_RDWR | O_NONBLOCK | O_CLOEXEC), .width = (size_t)set->width, .height = (size_t)set->height};
+    if (stream->fd < 0) {
+        GRABBER_TELL(grabber, "cannot open %s: %s; trying on", path, strerror(errno));
         return false;
-    if (choose_format(stream, V4L2_PIX_FMT_GREY) || choose_format(stream, V4L2_PIX_FMT_YUYV)) {
+    }
+    if (!is_camera(stream->fd)) {
+        GRABBER_TELL(grabber, "%s is no camera: set device to one of /dev/v4l/by-id that ends with index0", path);
+    } else if (choose(grabber, stream, path)) {
         set_controls(stream, set);
         if (map_buffers(stream) && request(stream->fd, VIDIOC_STREAMON, &type))
             return true;
+        GRABBER_TELL(grabber, "%s does not start: %s; trying on", path, strerror(errno));
     }
     close_stream(stream);
     return false;
@@ -137,7 +206,7 @@ static bool open_stream(struct stream *stream, const struct v4l2 *set)
 /* Whether all rows lie within what the driver says it has filled. */
 static bool complete(const struct stream *stream, const struct v4l2_buffer *buffer)
 {
-    size_t last_row = stream->width * (stream->format == V4L2_PIX_FMT_YUYV ? 2 : 1);
+    size_t last_row = stream->width * stream->format->pitch;
     size_t needed = stream->stride * (stream->height - 1) + last_row;
     return !(buffer->flags & V4L2_BUF_FLAG_ERROR) && buffer->bytesused >= needed &&
            stream->buffers[buffer->index].bytes >= needed;
@@ -145,12 +214,13 @@ static bool complete(const struct stream *stream, const struct v4l2_buffer *buff
 
 static void convert(const struct stream *stream, const uint8_t *from, uint8_t *to)
 {
+    const size_t pitch = stream->format->pitch, first = stream->format->first;
     for (size_t row = 0; row < stream->height; row++, from += stream->stride, to += stream->width) {
-        if (stream->format == V4L2_PIX_FMT_GREY) {
-            memcpy(to, from, stream->width);
-        } else { /* Y0 U Y1 V: the brightness is every other byte */
+        if (pitch == 1) {
+            memcpy(to, from, stream->width); /* mapped, as `index` < `count`: NOLINT(*NonNullParamChecker) */
+        } else {
             for (size_t column = 0; column < stream->width; column++)
-                to[column] = from[2 * column]; /* mapped, as `index` < `count`: NOLINT(*NullDereference) */
+                to[column] = from[pitch * column + first]; /* likewise: NOLINT(*NullDereference) */
         }
     }
 }
@@ -166,7 +236,7 @@ static int64_t taken_ns(const struct v4l2_buffer *buffer)
 }
 
 /* Take the frame that is ready; false when the camera is gone. */
-static bool take(struct stream *stream, struct frames *frames)
+static bool take(struct stream *stream, struct grabber *grabber)
 {
     struct v4l2_buffer buffer = buffer_of(0);
     if (!request(stream->fd, VIDIOC_DQBUF, &buffer))
@@ -174,8 +244,10 @@ static bool take(struct stream *stream, struct frames *frames)
     if (buffer.index >= stream->count)
         return false;
     if (complete(stream, &buffer)) {
-        convert(stream, stream->buffers[buffer.index].start, frames_back(frames));
-        frames_publish(frames, taken_ns(&buffer));
+        convert(stream, stream->buffers[buffer.index].start, frames_back(&grabber->frames));
+        grabber_publish(grabber, taken_ns(&buffer));
+    } else {
+        GRABBER_TELL(grabber, "an image is incomplete: check the cable");
     }
     return request(stream->fd, VIDIOC_QBUF, &buffer);
 }
@@ -184,14 +256,20 @@ static void run(struct fl_driver *driver, void *context)
 {
     struct grabber *grabber = context;
     struct stream stream;
+    const struct v4l2 *set = grabber->parameters;
     do {
-        if (!open_stream(&stream, grabber->parameters))
+        if (!open_stream(&stream, grabber))
             continue;
         atomic_store(&grabber->connected, true);
-        /* A camera that is silent for long is begun anew: some hang after a bus reset. */
-        while (fl_driver_wait(driver, stream.fd, false, SILENCE_MS) == 1 && take(&stream, &grabber->frames))
+        int ready;
+        while ((ready = fl_driver_wait(driver, stream.fd, false, SILENCE_MS)) == 1 && take(&stream, grabber))
             ;
         atomic_store(&grabber->connected, false);
+        /* A camera that is silent for long is begun anew: some hang after a bus reset. */
+        if (ready == 0)
+            GRABBER_TELL(grabber, "%s: no image for %d ms; beginning anew", set->device.path, SILENCE_MS);
+        else if (ready != -1)
+            GRABBER_TELL(grabber, "%s is gone; trying on", set->device.path);
         close_stream(&stream);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);
 }

@@ -1,6 +1,7 @@
 /* The grabber against a libdc1394 that is dc1394_bus.c. */
 #define _GNU_SOURCE
 #include "dc1394_bus.h"
+#include "said.h"
 #include "seccomp.h"
 #include "testbed.h"
 
@@ -93,6 +94,7 @@ static void waits_for_its_camera(void **state)
     (void)state;
     bus.present = false;
     looked = bus.looked;
+    struct said said = said_begin();
     struct fl_block *block = grabber(NULL, NULL);
     await(looked_again);
     look(block);
@@ -108,6 +110,9 @@ static void waits_for_its_camera(void **state)
     look(block);
     assert_int_equal(GET(block, "flag", uint8_t), 0);
     testbed_end(block);
+    assert_int_equal(said_times(&said, "no camera on the FireWire bus; trying on"), 1);
+    assert_int_equal(said_times(&said, "the camera is gone; trying on"), 1);
+    said_end(&said);
 }
 
 static void cuts_other_sizes_out(void **state)

@@ -1,6 +1,7 @@
 /* The grabber against a camera made of this file's own open, ioctl and mmap: no computer that runs the tests has one.
  * What this cannot show is what drivers do beyond their documentation. */
 #define _GNU_SOURCE
+#include "said.h"
 #include "seccomp.h"
 #include "testbed.h"
 
@@ -24,8 +25,9 @@ enum { WIDTH = 32, HEIGHT = 16, STRIDE = 80, BUFFERS = 3, LENGTH = 4096 };
 static struct {
     pthread_mutex_t lock;
     pthread_cond_t changed;
-    bool present, grey, wrong_size, streaming;
-    int fd, far_fd; /* its file, and the end that this test writes to: a byte for each frame */
+    bool present, wrong_size, streaming;
+    uint32_t format, able; /* the one that it has, and what it can do: V4L2_CAP_... */
+    int fd, far_fd;        /* its file, and the end that this test writes to: a byte for each frame */
     int memory_fd;
     uint8_t *memory;
     uint32_t queue[8], ready[8]; /* buffers that the driver may fill, and those that are filled */
@@ -68,8 +70,7 @@ int open(const char *path, int flags, ...)
 
 static int set_format(struct v4l2_pix_format *format)
 {
-    if (format->pixelformat == V4L2_PIX_FMT_GREY && !camera.grey)
-        format->pixelformat = V4L2_PIX_FMT_MJPEG; /* as drivers do: what it would do instead */
+    format->pixelformat = camera.format; /* as drivers do: what it would do instead */
     if (camera.wrong_size)
         format->width = 640;
     format->bytesperline = STRIDE;
@@ -93,6 +94,19 @@ static int answer(unsigned long code, void *argument)
     if (!camera.present)
         return refuse(ENODEV);
     switch (code) {
+    case VIDIOC_QUERYCAP:
+        if (!camera.able)
+            return refuse(ENOTTY);
+        ((struct v4l2_capability *)argument)->capabilities =
+            V4L2_CAP_DEVICE_CAPS | V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING; /* of all devices of the camera */
+        ((struct v4l2_capability *)argument)->device_caps = camera.able;
+        return 0;
+    case VIDIOC_ENUM_FMT:
+        if (((struct v4l2_fmtdesc *)argument)->index > 1)
+            return refuse(EINVAL);
+        ((struct v4l2_fmtdesc *)argument)->pixelformat =
+            ((struct v4l2_fmtdesc *)argument)->index ? V4L2_PIX_FMT_H264 : camera.format;
+        return 0;
     case VIDIOC_S_FMT:
         return set_format(&((struct v4l2_format *)argument)->fmt.pix);
     case VIDIOC_S_PARM:
@@ -150,11 +164,12 @@ void *mmap(void *address, size_t length, int protection, int flags, int fd, off_
 
 /* --- what a test does with it --- */
 
-static void plug(bool grey)
+static void plug(uint32_t format)
 {
     pthread_mutex_lock(&camera.lock);
     camera.present = true;
-    camera.grey = grey;
+    camera.format = format;
+    camera.able = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING;
     pthread_mutex_unlock(&camera.lock);
 }
 
@@ -195,6 +210,22 @@ static bool opened_again(void)
     return camera.opened > openings + 1;
 }
 
+/* Where the brightness of a pixel is in a row: Linux, Documentation/userspace-api/media/v4l, "YUV Formats". */
+static int place_of(uint32_t format, int column)
+{
+    switch (format) {
+    case V4L2_PIX_FMT_YUYV: /* Y0 U Y1 V */
+    case V4L2_PIX_FMT_YVYU:
+        return 2 * column;
+    case V4L2_PIX_FMT_UYVY: /* U Y0 V Y1 */
+    case V4L2_PIX_FMT_VYUY:
+    case V4L2_PIX_FMT_Y16: /* the high byte is the second */
+        return 2 * column + 1;
+    default: /* a plane of their own */
+        return column;
+    }
+}
+
 /* Expose a frame: pixel (column, row) has the brightness first + column + row, in the camera's format. */
 static void expose(uint8_t first, uint32_t flags, uint32_t bytes, int64_t at_ns)
 {
@@ -207,7 +238,7 @@ static void expose(uint8_t first, uint32_t flags, uint32_t bytes, int64_t at_ns)
     memset(memory, 0xEE, LENGTH);
     for (int row = 0; row < HEIGHT; row++)
         for (int column = 0; column < WIDTH; column++)
-            memory[row * STRIDE + column * (camera.grey ? 1 : 2)] = (uint8_t)(first + column + row);
+            memory[row * STRIDE + place_of(camera.format, column)] = (uint8_t)(first + column + row);
     camera.filled[camera.filled_count++] = (struct v4l2_buffer){
         .index = index,
         .type = V4L2_BUF_TYPE_VIDEO_CAPTURE,
@@ -243,9 +274,9 @@ static void assert_image(struct fl_block *block, uint8_t first)
             assert_int_equal(image[row * WIDTH + column], (uint8_t)(first + column + row));
 }
 
-static void grabs(bool grey)
+static void grabs(uint32_t format)
 {
-    plug(grey);
+    plug(format);
     struct fl_block *block = grabber(NULL, NULL);
     await(streams);
     look(block);
@@ -268,22 +299,69 @@ static void grabs(bool grey)
     testbed_end(block);
 }
 
-static void grabs_grey(void **state)
+static int forget(void **state)
 {
     (void)state;
-    grabs(true);
+    close(camera.far_fd);
+    camera.present = camera.streaming = false;
+    camera.fd = camera.far_fd = -1;
+    return 0;
 }
 
-static void grabs_yuyv(void **state)
+static void grabs_each_format_with_the_brightness_in_it(void **state)
 {
-    (void)state;
-    grabs(false);
+    static const uint32_t formats[] = {
+        V4L2_PIX_FMT_GREY,   V4L2_PIX_FMT_NV12,   V4L2_PIX_FMT_NV21, V4L2_PIX_FMT_NV16,
+        V4L2_PIX_FMT_YUV420, V4L2_PIX_FMT_YVU420, V4L2_PIX_FMT_YUYV, V4L2_PIX_FMT_YVYU,
+        V4L2_PIX_FMT_UYVY,   V4L2_PIX_FMT_VYUY,   V4L2_PIX_FMT_Y16,
+    };
+    for (size_t i = 0; i < sizeof formats / sizeof formats[0]; i++) {
+        grabs(formats[i]);
+        forget(state);
+    }
+}
+
+/* A camera that cannot be used says nothing by itself. */
+static void says_what_is_wrong(void **state)
+{
+    static const struct {
+        uint32_t format, able;
+        bool absent, wrong_size;
+        const char *said;
+    } cases[] = {
+        {.absent = true, .said = "cannot open /dev/video-test: No such file or directory; trying on"},
+        {.able = 0, .said = "/dev/video-test is no camera: set device to"},
+        {.able = V4L2_CAP_META_CAPTURE | V4L2_CAP_STREAMING, .said = "/dev/video-test is no camera: set device to"},
+        {.format = V4L2_PIX_FMT_MJPEG,
+         .able = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING,
+         .said = "/dev/video-test offers MJPG H264, of which none is read: take a camera with one of GREY NV12 "},
+        {.format = V4L2_PIX_FMT_UYVY,
+         .able = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING,
+         .wrong_size = true,
+         .said = "/dev/video-test has images of 640 x 16 pixels, not of 32 x 16: set width and height"},
+    };
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
+        struct said said = said_begin();
+        plug(cases[i].format);
+        camera.present = !cases[i].absent;
+        camera.able = cases[i].able;
+        camera.wrong_size = cases[i].wrong_size;
+        openings = camera.opened;
+        struct fl_block *block = grabber(NULL, NULL);
+        await(opened_again);
+        testbed_end(block);
+        assert_int_equal(said_times(&said, cases[i].said), 1);
+        assert_int_equal(said_times(&said, "frame-grabber-v4l2: "), 1);
+        camera.wrong_size = false;
+        forget(state);
+        said_end(&said);
+    }
 }
 
 static void leaves_out_bad_frames(void **state)
 {
     (void)state;
-    plug(true);
+    plug(V4L2_PIX_FMT_GREY);
     struct fl_block *block = grabber(NULL, NULL);
     await(streams);
     expose(1, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, LENGTH, fl_now_ns());
@@ -302,7 +380,7 @@ static void leaves_out_bad_frames(void **state)
 static void stamps_in_the_tasks_clock(void **state)
 {
     (void)state;
-    plug(true);
+    plug(V4L2_PIX_FMT_GREY);
     struct fl_block *block = grabber(NULL, NULL);
     await(streams);
     expose(1, V4L2_BUF_FLAG_TIMESTAMP_UNKNOWN, LENGTH, 5);
@@ -319,7 +397,7 @@ static void stamps_in_the_tasks_clock(void **state)
 static void returns_after_unplugging(void **state)
 {
     (void)state;
-    plug(true);
+    plug(V4L2_PIX_FMT_GREY);
     struct fl_block *block = grabber(NULL, NULL);
     await(streams);
     expose(1, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, LENGTH, fl_now_ns());
@@ -328,7 +406,7 @@ static void returns_after_unplugging(void **state)
     await(opened_again); /* it has looked for it at least twice */
     look(block);
     assert_int_equal(GET(block, "flag", uint8_t), 0);
-    plug(false);
+    plug(V4L2_PIX_FMT_YUYV);
     await(streams);
     expose(90, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, LENGTH, fl_now_ns());
     look(block);
@@ -341,7 +419,7 @@ static void returns_after_unplugging(void **state)
 static void takes_no_other_size(void **state)
 {
     (void)state;
-    plug(true);
+    plug(V4L2_PIX_FMT_GREY);
     camera.wrong_size = true;
     openings = camera.opened;
     int started = camera.started;
@@ -356,7 +434,7 @@ static void takes_no_other_size(void **state)
 static void sets_what_is_asked_for(void **state)
 {
     (void)state;
-    plug(true);
+    plug(V4L2_PIX_FMT_GREY);
     struct fl_block *block = grabber("rate", "12.5");
     await(streams);
     assert_near((double)camera.interval.denominator / camera.interval.numerator, 12.5, 1e-9);
@@ -372,7 +450,7 @@ static void sets_what_is_asked_for(void **state)
 static void steps_never_block(void **state)
 {
     (void)state;
-    plug(true);
+    plug(V4L2_PIX_FMT_GREY);
     struct fl_block *block = grabber(NULL, NULL);
     await(streams);
     expose(1, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, LENGTH, fl_now_ns());
@@ -390,20 +468,11 @@ static int prepare(void **state)
     return camera.memory == MAP_FAILED ? -1 : 0;
 }
 
-static int forget(void **state)
-{
-    (void)state;
-    close(camera.far_fd);
-    camera.present = camera.streaming = false;
-    camera.fd = camera.far_fd = -1;
-    return 0;
-}
-
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test_teardown(grabs_grey, forget),
-        cmocka_unit_test_teardown(grabs_yuyv, forget),
+        cmocka_unit_test_teardown(grabs_each_format_with_the_brightness_in_it, forget),
+        cmocka_unit_test_teardown(says_what_is_wrong, forget),
         cmocka_unit_test_teardown(leaves_out_bad_frames, forget),
         cmocka_unit_test_teardown(stamps_in_the_tasks_clock, forget),
         cmocka_unit_test_teardown(returns_after_unplugging, forget),
