@@ -134,9 +134,13 @@ def shipped(node: int) -> dict[Name, Entry]:
         (0x6084, 0): Entry(4, 10000, mapped="r"),
         (0x6085, 0): Entry(4, 10000, mapped="r"),
         (0x60FF, 0): _signed(4, mapped="rt"),
+        (0x6502, 0): Entry(4, 0x65, access="ro"),  # profile position and velocity, homing, interpolated position
         (0x6410, 0): Entry(1, 5, access="ro"),
         (0x6410, 1): Entry(2, 2000),
         (0x6410, 2): Entry(2, 4000),
+        (0x6410, 3): Entry(1, 1),
+        (0x6410, 4): Entry(4, 25000),
+        (0x6410, 5): Entry(2, 40),
         (0x2030, 0): _signed(2, mapped="rt"),
         (0x2062, 0): _signed(4, mapped="rt"),
         (0x206B, 0): _signed(4, mapped="rt"),
@@ -397,6 +401,7 @@ class Epos2:
         raise Abort(Abort.NO_SUB_INDEX if any(name[0] == index for name in self.objects) else Abort.NO_OBJECT)
 
     def _read(self, index: int, sub: int) -> bytes:
+        self._show()
         entry = self._entry(index, sub)
         return (entry.value % (1 << 8 * entry.size)).to_bytes(entry.size, "little")
 
@@ -539,7 +544,7 @@ class Epos2:
             self.axis = Axis.READY_TO_SWITCH_ON
         elif was in (Axis.READY_TO_SWITCH_ON, Axis.OPERATION_ENABLED) and not word & 0x08:
             self.axis = Axis.SWITCHED_ON
-        elif was is Axis.SWITCHED_ON and word & 0x08:
+        elif was in (Axis.READY_TO_SWITCH_ON, Axis.SWITCHED_ON) and word & 0x08:  # from the former by both transitions
             self.axis = Axis.OPERATION_ENABLED
             self._demand_rpm, self._demand_turns = 0.0, None
 
