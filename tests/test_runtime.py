@@ -171,7 +171,7 @@ REFUSED = {
         "3: cycle without delay: a → b → a; put a block delay into one of its wires",
     ),
     "a frame twice": (
-        task("a: {type: can-send, in: {data: 1}, parameters: {id: 9, length: 1}}\n" * 2).replace("a:", "b:", 1),
+        task("a: {type: can-send, in: {data: 1, age: 0}, parameters: {id: 9, length: 1}}\n" * 2).replace("a:", "b:", 1),
         '4: block a: interface "can0", id 9, extended false is block b\'s; a device serves one block',
     ),
     "a device twice": (
