@@ -91,7 +91,8 @@ def await_axis(server: Epos2Server, drive: Epos2, axis: Axis) -> None:
         with server.paused():
             if drive.axis is axis:
                 return
-        assert time.monotonic() < deadline
+            found = drive.axis, drive.nmt, drive.errors, drive.motor.rpm
+        assert time.monotonic() < deadline, found
         time.sleep(0.01)
 
 
@@ -292,17 +293,14 @@ def test_one_sync_for_all_drives(
 def test_two_tasks_share_one_sync(run: Any, hub: UdpHub) -> None:
     """The second task's drive is sampled by the first's SYNC, and by its own once the first has ended."""
     first, second = Epos2(NODE), Epos2(4)
-    with (
-        Epos2Server(hub, first, second).running(),
-        run(drive_task("velocity", 5)) as task,
-        run(OTHER, name="other") as other,
-    ):
-        task.until(lambda row: row["enabled"])
-        other.until(lambda row: row["flag"])
-        task.signal(signal.SIGSTOP)
-        other.until(lambda row: not row["flag"])
-        task.signal(signal.SIGKILL)
-        other.until(lambda row: row["flag"])
+    with Epos2Server(hub, first, second).running(), run(drive_task("velocity", 5)) as task:
+        task.until(lambda row: row["enabled"])  # so it is the one that sends
+        with run(OTHER, name="other") as other:
+            other.until(lambda row: row["flag"])
+            task.signal(signal.SIGSTOP)
+            other.until(lambda row: not row["flag"])
+            task.signal(signal.SIGKILL)
+            other.until(lambda row: row["flag"])
 
 
 def test_says_why_once(run: Any, hub: UdpHub, capfd: pytest.CaptureFixture[str]) -> None:

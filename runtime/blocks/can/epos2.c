@@ -552,14 +552,11 @@ size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_com
 {
     int64_t silence_ns = drive->settings.heartbeat_ms * MS;
     size_t count = 0;
-    if (now_ns - drive->heartbeat_ns >= silence_ns / 3) { /* one may be lost */
-        drive->heartbeat_ns = now_ns;
-        out[count] = frame_of(COB_HEARTBEAT + drive->settings.master, 1);
-        out[count++].data[0] = STATE_OPERATIONAL;
-    }
     if (drive->phase == EPOS2_CONFIGURING && drive->write_next == drive->write_count) {
         enter(drive, EPOS2_RUNNING, now_ns);
         drive->heard_ns = now_ns;
+        /* It misses ours only after it has heard one (CiA 301, object 1016), so that comes before it may move. */
+        drive->heartbeat_ns = INT64_MIN / 2;
         drive->contacted = true;
         drive->abort_code = 0;
         if (drive->trouble.cause != EPOS2_EMERGENCY)
@@ -571,6 +568,11 @@ size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_com
     }
     if (drive->phase == EPOS2_REFUSED && now_ns - drive->phase_ns >= refused_retry_ns)
         enter(drive, EPOS2_BOOTING, now_ns - boot_retry_ns);
+    if (now_ns - drive->heartbeat_ns >= silence_ns / 3) { /* one may be lost */
+        drive->heartbeat_ns = now_ns;
+        out[count] = frame_of(COB_HEARTBEAT + drive->settings.master, 1);
+        out[count++].data[0] = STATE_OPERATIONAL;
+    }
     bool armed = is_armed(drive, command->enable);
     if (drive->phase == EPOS2_BOOTING)
         count += boot(drive, now_ns, &out[count]);

@@ -662,6 +662,27 @@ static void sends_heartbeats(void **state)
     test_free(stub);
 }
 
+/* A drive that has not heard any would not miss them: the motor would run on for ever. */
+static void a_heartbeat_comes_before_any_motion(void **state)
+{
+    (void)state;
+    struct epos2_settings settings = usual;
+    settings.heartbeat_ms = 10000;
+    struct stub *stub = make(settings);
+    stub->command.enable = true;
+    bool heard = false;
+    while (!stub->operational) {
+        bool watches = object(stub, 0x101601);
+        period(stub);
+        for (size_t i = 0; i < stub->sent_count && !stub->engine.sdo_waiting; i++) {
+            heard = heard || (watches && stub->sent[i].can_id == 0x77F);
+            assert_true(stub->sent[i].can_id != 0 || stub->sent[i].data[0] != 1 || heard); /* NMT start */
+        }
+    }
+    assert_true(heard);
+    test_free(stub);
+}
+
 static void offers_positions_by_edges(void **state)
 {
     (void)state;
@@ -807,6 +828,7 @@ int main(void)
         cmocka_unit_test(enable_is_for_a_drive_that_is_there),
         cmocka_unit_test(names_the_first_cause),
         cmocka_unit_test(sends_heartbeats),
+        cmocka_unit_test(a_heartbeat_comes_before_any_motion),
         cmocka_unit_test(offers_positions_by_edges),
         cmocka_unit_test(disables_at_once),
         cmocka_unit_test(ignores_what_is_not_the_drives),
