@@ -13,7 +13,7 @@ static bool is_new(struct fl_reasons *reasons, const char *reason)
             return false;
     if (reasons->count == FL_REASONS)
         return false;
-    strcpy(reasons->told[reasons->count++], reason);
+    memcpy(reasons->told[reasons->count++], reason, strlen(reason) + 1);
     return true;
 }
 

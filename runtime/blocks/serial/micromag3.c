@@ -59,7 +59,7 @@ enum {
 };
 
 /* Manual, pages 13 and 18 to 28. The board sends z in raw mode only; one without such a sensor refuses ez. */
-enum stage { STOPPING, FORMAT = 3, Z_AXIS = 7, RATE = 8, RUNNING };
+enum stage { STOPPING = 0, FORMAT = 3, Z_AXIS = 7, RATE = 8, RUNNING = 9 };
 static const char *const commands[RUNNING] = {
     "h", "uc=d", "sn=m", [FORMAT] = "sdo=t", "ec=e", "ex=e", "ey=e", [Z_AXIS] = "ez=e", [RATE] = "pollfreq="};
 

@@ -55,7 +55,7 @@ bool micromag3_feed(struct micromag3_parser *parser, uint8_t byte, struct microm
         record->reason = "a record's checksum is wrong: check the cable, or set checksum: none";
         return false;
     }
-    const char *heading = strncmp(record->text, "raw,", 4) && *record->text == 'C' ? record->text + 1 : NULL;
+    const char *heading = *record->text == 'C' ? record->text + 1 : NULL;
     if (heading && *heading >= '0' && *heading <= '9' && !in_degrees(heading)) {
         record->reason = "the heading is in mils: the board did not take uc=d";
         return false;

@@ -326,9 +326,9 @@ static void gives_radians_and_sign(void **state)
             assert_int_equal(line_step(gyro), FL_OK);
             assert_false(flag(gyro));
         }
-        say_lines(&line, "      90.000000   1\r\n", SETTLING + 1);
-        STEP_UNTIL(gyro, flag(gyro));
-        assert_int_equal(GET(gyro, "sequence", uint32_t), REPEATS + SETTLING);
+        /* More where the machine was so busy that the gyro seemed silent. */
+        STEP_UNTIL(gyro, (say_lines(&line, "      90.000000   1\r\n", 1), flag(gyro)));
+        assert_true(GET(gyro, "sequence", uint32_t) >= REPEATS + SETTLING);
         assert_near(GET(gyro, "rate", double), cases[i].sign * 90 * DEGREE, 1e-12);
         testbed_end(gyro);
         line_unplug(&line);
@@ -387,12 +387,9 @@ static void says_what_is_wrong(void **state)
     testbed_end(gyro);
     gyro = testbed_block("dsp3000", "device", line.path, "format", "words", NULL);
     testbed_begin(gyro);
-    for (int32_t i = 0; i < 100; i++) {
-        uint32_t word = word_of(true, DSP3000_INTEGRATED, 1234567 + i);
-        for (int shift = 24; shift >= 0; shift -= 8)
-            line_write(&line, (const uint8_t[]){(uint8_t)(word >> shift)}, 1);
-    }
-    AWAIT(said_times(&said, "the gyro sends words of another mode") == 1);
+    uint32_t word = word_of(true, DSP3000_INTEGRATED, 1234567);
+    const uint8_t bytes[] = {(uint8_t)(word >> 24), (uint8_t)(word >> 16), (uint8_t)(word >> 8), (uint8_t)word};
+    AWAIT((line_write(&line, bytes, sizeof bytes), said_times(&said, "the gyro sends words of another mode") == 1));
     testbed_end(gyro);
     line_unplug(&line);
     said_end(&said);
@@ -460,7 +457,6 @@ static void counts_each_increment_once(void **state)
     STEP_UNTIL(gyro, (line_say(&line, "       0.000000   1\r\n"), flag(gyro)));
     assert_true(line_hears(&line, "A"));
     say_lines(&line, "       0.000000   1\r\n", 40);
-    steps_under_seccomp(gyro, 3);
     double sum = 0;
     say_lines(&line, "       0.125000   1\r\n", 40);
     STEP_UNTIL(gyro, (sum += GET(gyro, "increment", double)) > 39.5 * 0.125 * DEGREE);
@@ -475,6 +471,7 @@ static void counts_each_increment_once(void **state)
     /* One that no gyro can have turned in 10 ms. */
     STEP_UNTIL(gyro, (line_say(&line, "       3.900000   1\r\n"), !flag(gyro)));
     assert_near(GET(gyro, "increment", double), 0, 0);
+    steps_under_seccomp(gyro, 3); /* last: it takes so long that the gyro would seem silent */
     testbed_end(gyro);
     line_unplug(&line);
 }
