@@ -83,7 +83,7 @@ def good_batteries(row: Row) -> bool:
 
 
 def scanner() -> Urg:
-    return Urg(lambda step, seconds: 7 if step == 50 else 1000 + step, old=True, noise=0)
+    return Urg(lambda step, seconds: 7 if step == 50 else 1000 + step, old=True, baud=115200, noise=0)
 
 
 SCAN = {"first_step": 44, "last_step": 143}
