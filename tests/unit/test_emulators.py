@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from hokuyolx import HokuyoLX
 
 from tests.emulators import dsp3000, micromag3, oceanserver, urg
 from tests.emulators.dsp3000 import Dsp3000, Mode
@@ -491,6 +492,57 @@ def test_urg_clusters_and_marks_what_it_does_not_measure() -> None:
     points = [data[at : at + 3] for at in range(0, len(data), 3)]
     # Of steps 43 to 45 the first has an error code, which is no distance.
     assert points == [urg.encode(number, 3) for number in (19, 4955, 4952, 4951)]
+
+
+class Tcp:
+    """A listening socket's next connection, as Hokuyo's scanners with Ethernet have it."""
+
+    path = "TCP"
+
+    def __init__(self, server: socket.socket) -> None:
+        self._server = server
+
+    def plug(self) -> int:
+        self._socket, _ = self._server.accept()
+        self._socket.setblocking(False)
+        return self._socket.fileno()
+
+    def unplug(self) -> None:
+        self._socket.close()
+
+    def robot_baud(self) -> int | None:
+        return None
+
+
+def test_urg_satisfies_a_driver_by_others() -> None:
+    """hokuyolx reads and judges all that it is told: names, checksums, statuses, echoes, lengths."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        driver = HokuyoLX(
+            activate=False, info=False, tsync=False, convert_time=False, addr=server.getsockname(), timeout=TIMEOUT
+        )
+        scanner = Urg(noise=0)
+        with SerialLine(scanner, Tcp(server)):
+            assert driver.version()["PROT"] == "SCIP 2.0"
+            assert driver.sensor_state()["STAT"] == "Sensor works well."
+            driver.update_info()
+            assert (driver.amin, driver.amax, driver.aforw, driver.ares, driver.scan_freq) == (44, 725, 384, 1024, 10)
+            assert driver.tsync_enter()[0] == "00"
+            assert driver.tsync_get() >= 0
+            assert driver.tsync_exit()[0] == "00"
+            assert driver.tsync_exit()[0] == "03"
+            assert [driver.activate()[0] for _ in range(2)] == [0, 2]
+            _, distances = driver.get_dist()
+            assert distances.tolist() == [1000 + step for step in range(44, 726)]
+            scans = list(driver.iter_dist(scans=3, start=50, end=59, grouping=2, skips=1))
+            assert [(scan.tolist(), pending) for scan, _, pending in scans] == [
+                ([1050, 1052, 1054, 1056, 1058], pending) for pending in (2, 1, 0)
+            ]
+            assert scans[0][1] < scans[1][1] < scans[2][1]
+            driver.activate()
+            driver.standby()
+            assert not scanner.laser
+            driver.reset()
+        driver.close()
 
 
 # --- the program ---
