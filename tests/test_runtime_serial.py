@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -275,3 +276,30 @@ def test_laser_scanner(flotilla_run: Path, tmp_path: Path, mode: str) -> None:
         while device.laser:  # the task has ended, and said so
             assert time.monotonic() < end
             time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("state", "baud", "parameters"),
+    [
+        (lambda scanner: scanner.received(b"TM0\n"), 115200, {}),
+        (lambda scanner: scanner.received(b"MD0044072501000\nSS057600\n"), 19200, {}),
+        (lambda scanner: None, 115200, {"skip": 9, "cluster": 2, "first_step": 44, "last_step": 243}),
+        (lambda scanner: scanner.received(b"MD00440"), 19200, {"characters": 2}),
+    ],
+    ids=["adjusting the time", "streaming at another rate", "with long pauses", "half a command"],
+)
+def test_laser_scanner_as_it_was_left(
+    flotilla_run: Path, tmp_path: Path, state: Callable[[Urg], object], baud: int, parameters: dict[str, Any]
+) -> None:
+    device = Urg(lambda step, seconds: 7 if step == 50 else 1000 + step, baud=baud, noise=0)
+    with SerialLine(device) as line:
+        state(device)
+        given = {**SCAN, **parameters, "timeout": 30}
+        with watching(flotilla_run, tmp_path, line, "urg", "ranges", **given) as run:
+            row = run.until(lambda row: row["sequence"] > 2)
+            if "cluster" in parameters:
+                expected = [51 if step == 50 else step for step in range(44, 244, 2)]  # the error code is no distance
+                assert row["ranges"] == pytest.approx([(1000 + step) / 1000 for step in expected])
+            else:
+                check_scan(row)
+            assert device.baud == 115200

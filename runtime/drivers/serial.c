@@ -6,6 +6,7 @@
 #include <flotilla/driver.h>
 #include <inttypes.h>
 #include <limits.h>
+#include <poll.h>
 #include <stdatomic.h>
 #include <stdlib.h>
 #include <string.h>
@@ -20,7 +21,8 @@ enum {
     SEND_BYTES = 64,
     REOPEN_MS = 100,
     SILENCE_MS = 100,
-    STUCK_MS = 1000, /* a port that takes no byte for so long is opened anew */
+    STUCK_MS = 1000,  /* a port that does not take what is to be sent for so long is opened anew */
+    CLOSING_MS = 500, /* for all that is still to be sent when the thread shall return */
     BATCH = 256,
     RATE_TOLERANCE = 50, /* 1/50: UARTs agree on a character up to some 4 % between them, of which this is half */
 };
@@ -51,6 +53,8 @@ struct fl_serial {
     unsigned writing, reading; /* slots of the thread and of the step */
     _Atomic unsigned middle;   /* the third, and FRESH until the step has swapped it */
     void *parser;
+    int64_t baud;        /* that the port is set to */
+    int64_t close_by_ns; /* 0: the thread need not return yet */
     uint32_t sequence;
     int open_error; /* last told */
     struct fl_reasons reasons;
@@ -70,11 +74,9 @@ static int lock_port(int fd)
     return -1;
 }
 
-int fl_serial_open(const struct fl_serial_settings *settings)
+/* 0, or an errno. */
+static int set_port(int fd, const struct fl_serial_settings *settings)
 {
-    int fd = open(settings->device, O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
-    if (fd < 0)
-        return -1;
     static const unsigned sizes[] = {CS5, CS6, CS7, CS8};
     static const unsigned parities[] = {0, PARENB | PARODD, PARENB};
     struct termios2 raw = {.c_cc = {[VMIN] = 1}};
@@ -83,13 +85,20 @@ int fl_serial_open(const struct fl_serial_settings *settings)
     raw.c_iflag = IGNBRK | (settings->parity ? INPCK : 0);
     raw.c_ispeed = raw.c_ospeed = (speed_t)settings->baud;
     struct termios2 set;
-    int error = 0;
-    if (lock_port(fd) < 0 || ioctl(fd, TCSETS2, &raw) < 0 || ioctl(fd, TCGETS2, &set) < 0 ||
-        ioctl(fd, TCFLSH, TCIOFLUSH) < 0)
-        error = errno;
+    if (ioctl(fd, TCSETS2, &raw) < 0 || ioctl(fd, TCGETS2, &set) < 0)
+        return errno;
     /* A driver takes the nearest rate it has, or the one before, and says nothing. */
-    else if (llabs((long long)set.c_ospeed - settings->baud) > settings->baud / RATE_TOLERANCE)
-        error = ERANGE;
+    return llabs((long long)set.c_ospeed - settings->baud) > settings->baud / RATE_TOLERANCE ? ERANGE : 0;
+}
+
+int fl_serial_open(const struct fl_serial_settings *settings)
+{
+    int fd = open(settings->device, O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
+    if (fd < 0)
+        return -1;
+    int error = lock_port(fd) < 0 ? errno : set_port(fd, settings);
+    if (!error && ioctl(fd, TCFLSH, TCIOFLUSH) < 0)
+        error = errno;
     if (error) {
         close(fd);
         errno = error;
@@ -98,38 +107,88 @@ int fl_serial_open(const struct fl_serial_settings *settings)
     return fd;
 }
 
-/* Send all of `bytes`; false when the thread shall return, or the device is gone or stuck. */
-static bool write_all(const struct fl_driver *driver, int fd, const uint8_t *bytes, size_t count)
+static int left_ms(int64_t until_ns)
 {
+    int64_t left_ns = until_ns - fl_now_ns();
+    return left_ns > 0 ? (int)(left_ns / 1000000) + 1 : 0;
+}
+
+/* From here on nothing keeps the thread from returning in time. */
+static void begin_closing(struct fl_serial *serial)
+{
+    if (!serial->close_by_ns)
+        serial->close_by_ns = fl_now_ns() + CLOSING_MS * INT64_C(1000000);
+}
+
+/* 1, 0 after the time, or -2: the device is gone. */
+static int wait_writable(struct fl_serial *serial, const struct fl_driver *driver, int fd, int64_t until_ns)
+{
+    if (!serial->close_by_ns) {
+        int ready = fl_driver_wait(driver, fd, true, left_ms(until_ns));
+        if (ready != -1)
+            return ready;
+        begin_closing(serial);
+    }
+    struct pollfd waiting = {.fd = fd, .events = POLLOUT};
+    if (poll(&waiting, 1, left_ms(until_ns < serial->close_by_ns ? until_ns : serial->close_by_ns)) < 1)
+        return 0;
+    return waiting.revents & POLLOUT ? 1 : -2;
+}
+
+/* Send all of `bytes`, also when the thread shall return meanwhile: half a command would spoil the one that is sent
+ * last, which makes the device safe. 0, or an errno: ETIMEDOUT of a port that is stuck, EIO of a device that is gone.
+ */
+static int write_all(struct fl_serial *serial, const struct fl_driver *driver, int fd, const uint8_t *bytes,
+                     size_t count)
+{
+    int64_t until_ns = fl_now_ns() + STUCK_MS * INT64_C(1000000);
     while (count) {
         ssize_t written = write(fd, bytes, count);
         if (written > 0) {
             bytes += written;
             count -= (size_t)written;
-        } else if ((written < 0 && errno != EAGAIN && errno != EINTR) ||
-                   fl_driver_wait(driver, fd, true, STUCK_MS) <= 0) {
-            return false;
+            continue;
         }
+        if (written < 0 && errno != EAGAIN && errno != EINTR)
+            return errno;
+        int ready = wait_writable(serial, driver, fd, until_ns);
+        if (ready < 1)
+            return ready ? EIO : ETIMEDOUT;
     }
-    return true;
+    return 0;
 }
 
-static bool send_request(struct fl_serial *serial, const struct fl_driver *driver, int fd, int silent_ms)
+/* A rate that the port lacks is none at which its device answers: that is for the protocol to find out. */
+static void change_baud(struct fl_serial *serial, int fd, int64_t baud)
+{
+    struct fl_serial_settings settings = serial->settings;
+    if (baud)
+        settings.baud = baud;
+    if (settings.baud == serial->baud)
+        return;
+    serial->baud = settings.baud;
+    set_port(fd, &settings);
+    ioctl(fd, TCFLSH, TCIFLUSH); /* what came at the other rate */
+}
+
+static int send_request(struct fl_serial *serial, const struct fl_driver *driver, int fd, int silent_ms)
 {
     uint8_t out[SEND_BYTES];
     if (!serial->protocol->send)
-        return true;
-    return write_all(driver, fd, out,
-                     serial->protocol->send(serial->parser, serial->parameters, silent_ms, out, sizeof out));
+        return 0;
+    size_t count = serial->protocol->send(serial->parser, serial->parameters, silent_ms, out, sizeof out);
+    if (serial->protocol->baud)
+        change_baud(serial, fd, serial->protocol->baud(serial->parser));
+    return write_all(serial, driver, fd, out, count);
 }
 
-static bool send_queued(struct fl_serial *serial, const struct fl_driver *driver, int fd)
+static int send_queued(struct fl_serial *serial, const struct fl_driver *driver, int fd)
 {
     struct sending queued;
-    while (fl_ring_take(&serial->sendings, &queued))
-        if (!write_all(driver, fd, queued.bytes, queued.count))
-            return false;
-    return true;
+    int error = 0;
+    while (!error && fl_ring_take(&serial->sendings, &queued))
+        error = write_all(serial, driver, fd, queued.bytes, queued.count);
+    return error;
 }
 
 static void forget_queued(struct fl_serial *serial)
@@ -181,36 +240,53 @@ static void judge(struct fl_serial *serial, size_t bytes, unsigned measurements)
     }
 }
 
-/* Talk to an open port until it is gone (true) or the thread shall return (false). */
-static bool converse(struct fl_serial *serial, const struct fl_driver *driver, int fd)
+/* Talk to an open port until the thread shall return (0), or it is gone or stuck (an errno). */
+static int converse(struct fl_serial *serial, const struct fl_driver *driver, int fd)
 {
     int64_t heard_ns = fl_now_ns();
     memset(serial->parser, 0, serial->protocol->parser_size);
     serial->judged_ns = heard_ns;
     serial->heard = false;
-    if (!send_request(serial, driver, fd, FL_SERIAL_OPENED))
-        return true;
-    for (;;) {
+    int error = send_request(serial, driver, fd, FL_SERIAL_OPENED);
+    while (!error) {
         uint8_t bytes[BATCH];
         ssize_t count = 0;
         unsigned measurements = 0;
         int ready = fl_driver_wait(driver, fd, false, SILENCE_MS);
         if (ready < 0)
-            return ready == -2;
+            return ready == -2 ? EIO : 0;
         if (ready > 0) {
             count = read(fd, bytes, sizeof bytes);
             if (count == 0 || (count < 0 && errno != EAGAIN && errno != EINTR))
-                return true;
+                return EIO;
             if (count > 0)
                 measurements = feed(serial, bytes, (size_t)count);
             heard_ns = fl_now_ns();
         }
         judge(serial, count > 0 ? (size_t)count : 0, measurements);
         int64_t silent_ms = ready > 0 ? 0 : (fl_now_ns() - heard_ns) / 1000000;
-        if (!send_request(serial, driver, fd, silent_ms < INT_MAX ? (int)silent_ms : INT_MAX) ||
-            !send_queued(serial, driver, fd))
-            return true;
+        error = send_request(serial, driver, fd, silent_ms < INT_MAX ? (int)silent_ms : INT_MAX);
+        if (!error)
+            error = send_queued(serial, driver, fd);
     }
+    return error;
+}
+
+/* Send what is left, and how the device is to be left, and wait until it is on the wire: close() would, for up to half
+ * a minute. */
+static int end(struct fl_serial *serial, const struct fl_driver *driver, int fd)
+{
+    begin_closing(serial);
+    int error = send_queued(serial, driver, fd);
+    if (!error)
+        error = send_request(serial, driver, fd, FL_SERIAL_CLOSING);
+    int waiting = 0;
+    while (!error && ioctl(fd, TIOCOUTQ, &waiting) == 0 && waiting)
+        if (left_ms(serial->close_by_ns))
+            poll(NULL, 0, 1);
+        else
+            error = ETIMEDOUT;
+    return error;
 }
 
 /* Say once why a port cannot be opened, not ten times a second. */
@@ -237,14 +313,16 @@ static void run(struct fl_driver *driver, void *context)
             continue;
         forget_queued(serial);
         atomic_store(&serial->connected, true);
-        bool gone = converse(serial, driver, fd);
+        serial->baud = serial->settings.baud;
+        int error = converse(serial, driver, fd);
         atomic_store(&serial->connected, false);
-        if (gone) {
+        if (!error)
+            error = end(serial, driver, fd);
+        if (error) {
             /* Else close() would wait for what can no longer be sent. */
             ioctl(fd, TCFLSH, TCIOFLUSH);
-            fl_log(serial->block, "%s is gone", serial->settings.device);
-        } else if (send_queued(serial, driver, fd)) {
-            send_request(serial, driver, fd, FL_SERIAL_CLOSING);
+            fl_log(serial->block, "%s %s", serial->settings.device,
+                   error == ETIMEDOUT ? "takes no more bytes: closed" : "is gone");
         }
         close(fd);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);

@@ -36,7 +36,7 @@ class Device(ABC):
     """What hangs on a serial line. Its messages are the units that faults apply to."""
 
     baud: int
-    """Rate that it is set to."""
+    """Rate that it is set to. What `received` answers still leaves at the one before."""
     jitter: float = 0.0002
     """How much later than due a message leaves it at most, in s."""
 
@@ -251,10 +251,11 @@ class SerialLine:
             data = os.read(self._descriptor, 4096)
         except OSError as error:
             return error.errno in (errno.EAGAIN, errno.EINTR)
-        self._send(self.device.received(data))
+        baud = self.device.baud
+        self._send(self.device.received(self._over_the_wire(data, baud, inwards=True)), baud)
         return bool(data)
 
-    def _send(self, messages: Iterable[bytes]) -> None:
+    def _send(self, messages: Iterable[bytes], baud: int | None = None) -> None:
         for message in messages:
             self._held.append(self._spoil(message))
             self.sent += 1
@@ -264,7 +265,8 @@ class SerialLine:
             return
         data, self._held = b"".join(self._held), []
         with contextlib.suppress(BlockingIOError, BrokenPipeError, ConnectionError):
-            os.write(self._descriptor, self._over_the_wire(data))  # nobody listens: a wire does not wait
+            # Nobody listens: a wire does not wait.
+            os.write(self._descriptor, self._over_the_wire(data, baud or self.device.baud))
 
     def _spoil(self, message: bytes) -> bytes:
         faults = self.faults
@@ -278,10 +280,13 @@ class SerialLine:
             return bytes(spoilt)
         return message
 
-    def _over_the_wire(self, data: bytes) -> bytes:
-        sent = self.faults.baud or self.device.baud
-        heard = self._endpoint.robot_baud()
-        if heard is None:
-            heard = self.device.baud
+    def _over_the_wire(self, data: bytes, baud: int, *, inwards: bool = False) -> bytes:
+        """What the other end makes of bytes, while the device is set to a rate."""
+        device = self.faults.baud or baud
+        robot = self._endpoint.robot_baud()
+        if robot is None:
+            robot = baud
         # UARTs agree on a character while they are less than some 4 % apart.
-        return data if abs(heard - sent) <= 0.04 * sent else at_wrong_baud(data, sent, heard)
+        if abs(robot - device) <= 0.04 * device:
+            return data
+        return at_wrong_baud(data, robot, device) if inwards else at_wrong_baud(data, device, robot)

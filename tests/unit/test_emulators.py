@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from hokuyolx import HokuyoLX
 
 from tests.emulators import dsp3000, micromag3, oceanserver, urg
 from tests.emulators.dsp3000 import Dsp3000, Mode
@@ -384,25 +385,175 @@ def test_urg_obeys() -> None:
         ("MD00440725010x0", "07"),
         ("XX", "0E"),
         ("SCIP2.0", "0E"),
+        ("MD004407250100", "0C"),
+        ("QT0", "0D"),
+        ("QT;0123456789abcdefg", "0G"),
+        ("QT;a,b", "0H"),
+        ("TM3", "01"),
+        ("TM1", "04"),
+        ("TM2", "03"),
+        ("SS0192x0", "01"),
+        ("SS012345", "02"),
+        ("SS019200", "03"),
+        ("SS038400", "04"),
+        ("CR1x", "01"),
+        ("CR11", "02"),
+        ("CR00", "03"),
+        ("HS2", "01"),
+        ("HS0", "02"),
     ],
 )
 def test_urg_refuses(command: str, status: str) -> None:
     assert Urg().received(f"{command}\n".encode()) == [urg.reply(command, status)]
 
 
-def test_old_urg_has_to_be_switched() -> None:
-    scanner = Urg(old=True)
-    assert scanner.received(b"BM\n") == []
+def test_old_urg_answers_as_it_used_to_until_it_is_switched() -> None:
+    """As urg_library and Player expect it: a status of one character, and E for what it does not know."""
+    scanner = Urg(old=True, noise=0)
+    assert scanner.received(b"QT\nBM\n") == [b"QT\nE\n\n", b"BM\nE\n\n"]
+    version = scanner.received(b"V\n")[0].decode().split("\n")
+    assert version[:3] == ["V", "0", "VEND:Hokuyo Automatic Co.,Ltd."]
+    assert version[4].startswith("FIRM:3.1.04")
+    lines = scanner.received(b"G00076801\n")[0].decode().split("\n")
+    assert lines[:2] == ["G00076801", "0"]
+    assert [len(line) for line in lines[2:-2]] == [64] * 24 + [2]  # 769 points of two characters
+    assert scanner.received(b"L0\n") == [b"L0\n0\n\n"]
+    assert scanner.received(b"G00076801\n") == [b"G00076801\nE\n\n"]
+    assert scanner.received(b"L1\nS1152000000000\n") == [b"L1\n0\n\n", b"S1152000000000\n0\n\n"]
+    assert scanner.baud == 115200
     assert scanner.received(b"SCIP2.0\n") == [b"SCIP2.0\n0\n\n"]
+    assert not scanner.laser
     assert scanner.received(b"BM\n") == [b"BM\n00P\n\n"]
+
+
+RECORDED = [
+    # What a URG-04LX answered: hokuyo_aist, examples/example_urg_04lx.logr.
+    "VV\n00P\nVEND:Hokuyo Automatic Co.,Ltd.;[\nPROD:SOKUIKI Sensor URG-04LX;[\nFIRM:3.1.04(02/Aug./2007);a\n"
+    "PROT:SCIP 2.0;N\nSERI:H0706400;F\n\n",
+    "PP\n00P\nMODL:URG-04LX(Hokuyo Automatic Co.,Ltd.);N\nDMIN:20;4\nDMAX:5600;_\nARES:1024;\\\nAMIN:44;7\n"
+    "AMAX:725;o\nAFRT:384;6\nSCAN:600;e\n\n",
+    "II\n00P\nMODL:URG-04LX(Hokuyo Automatic Co.,Ltd.);N\nLASR:ON;9\n"
+    "SCSP:Initial(600[rpm])<-Default setting by user;A\nMESM:CLASSIC;^\nSBPS:19200[bps]<-Default setting by user;A\n"
+    "TIME:6A5404;]\nSTAT:Sensor works well.;8\n\n",
+    "BM\n02R\n\n",
+    "CR00\n03S\n\n",
+]
+
+
+def test_urg_answers_as_recorded() -> None:
+    scanner = Urg(noise=0)
+    scanner.received(b"BM\n")
+    scanner.measure(0x6A5404 / 1000)
+    for answer in RECORDED:
+        command = answer.split("\n")[0]
+        assert scanner.received(f"{command}\n".encode()) == [answer.encode()]
+
+
+def test_urg_adjusts_the_time_and_obeys_nothing_else_meanwhile() -> None:
+    scanner = Urg()
+    scanner.received(b"BM\n")
+    assert scanner.received(b"TM0\n") == [b"TM0\n00P\n\n"]
+    assert not scanner.laser
+    assert scanner.received(b"QT\nTM0\n") == [b"QT\n0Ee\n\n", b"TM0\n02R\n\n"]
+    scanner.measure(0x323DBB / 1000)
+    # As recorded of a UXM-30LX-E, whose II told 323D56 before: hokuyo_aist, examples/example_uxm_30lx_e.logr.
+    assert scanner.received(b"TM1\n") == [b"TM1\n00P\n<SfkP\n\n"]
+    assert scanner.received(b"TM2\nQT\n") == [b"TM2\n00P\n\n", b"QT\n00P\n\n"]
+    scanner.received(b"MD0044072501000\n")
+    assert scanner.received(b"TM0\n") == [b"TM0\n10Q\n\n"]
+
+
+def test_urg_forgets_its_settings_at_a_reset() -> None:
+    scanner = Urg()
+    assert scanner.received(b"SS115200;a\nCR10\nHS1\nBM\n") == [
+        urg.reply(command, "00") for command in ("SS115200;a", "CR10", "HS1", "BM")
+    ]
+    assert (scanner.baud, scanner.laser) == (115200, True)
+    assert period_of(scanner) == pytest.approx(1 / 9)
+    assert scanner.received(b"RS\n") == [b"RS\n00P\n\n"]
+    assert (scanner.baud, scanner.laser) == (19200, False)
+    assert period_of(scanner) == pytest.approx(1 / 10)
+
+
+def test_urg_tells_of_trouble() -> None:
+    scanner = Urg()
+    scanner.received(b"MD0044072501000\n")
+    scanner.trouble = "51"
+    assert scanner.measure(0.1) == [urg.reply("MD0044072501000", "51")]
+    assert scanner.measure(0.2) == []
+    assert scanner.received(b"BM\nGD0044072501\n") == [urg.reply("BM", "01"), urg.reply("GD0044072501", "51")]
+
+
+def test_urg_answers_a_new_rate_at_the_old_one() -> None:
+    with SerialLine(Urg()) as line:
+        robot = Robot(line.path, termios.B19200)
+        os.write(robot.fd, b"SS115200\n")
+        robot.read_until(lambda heard: heard == b"SS115200\n00P\n\n")
+        robot.close()
+        robot = Robot(line.path, termios.B115200)
+        os.write(robot.fd, b"\nQT\n")
+        robot.read_until(lambda heard: heard == b"QT\n00P\n\n")
+        robot.close()
 
 
 def test_urg_clusters_and_marks_what_it_does_not_measure() -> None:
     scanner = Urg(lambda step, seconds: 5000 - step, noise=0)
     scanner.received(b"BM\n")
-    data = scanner.received(b"GD0040004902\n")[0].decode().split("\n")[3][:-1]
+    data = scanner.received(b"GD0040004903\n")[0].decode().split("\n")[3][:-1]
     points = [data[at : at + 3] for at in range(0, len(data), 3)]
-    assert points == [urg.encode(number, 3) for number in (19, 19, 4955, 4953, 4951)]
+    # Of steps 43 to 45 the first has an error code, which is no distance.
+    assert points == [urg.encode(number, 3) for number in (19, 4955, 4952, 4951)]
+
+
+class Tcp:
+    """A listening socket's next connection, as Hokuyo's scanners with Ethernet have it."""
+
+    path = "TCP"
+
+    def __init__(self, server: socket.socket) -> None:
+        self._server = server
+
+    def plug(self) -> int:
+        self._socket, _ = self._server.accept()
+        self._socket.setblocking(False)
+        return self._socket.fileno()
+
+    def unplug(self) -> None:
+        self._socket.close()
+
+    def robot_baud(self) -> int | None:
+        return None
+
+
+def test_urg_satisfies_a_driver_by_others() -> None:
+    """hokuyolx reads and judges all that it is told: names, checksums, statuses, echoes, lengths."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        driver = HokuyoLX(
+            activate=False, info=False, tsync=False, convert_time=False, addr=server.getsockname(), timeout=TIMEOUT
+        )
+        scanner = Urg(noise=0)
+        with SerialLine(scanner, Tcp(server)):
+            assert driver.version()["PROT"] == "SCIP 2.0"
+            assert driver.sensor_state()["STAT"] == "Sensor works well."
+            driver.update_info()
+            assert (driver.amin, driver.amax, driver.aforw, driver.ares, driver.scan_freq) == (44, 725, 384, 1024, 10)
+            assert driver.tsync_enter()[0] == "00"
+            assert driver.tsync_get() >= 0
+            assert driver.tsync_exit()[0] == "00"
+            assert driver.tsync_exit()[0] == "03"
+            assert [driver.activate()[0] for _ in range(2)] == [0, 2]
+            _, distances = driver.get_dist()
+            assert distances.tolist() == [1000 + step for step in range(44, 726)]
+            scans = list(driver.iter_dist(scans=3, start=50, end=59, grouping=2, skips=1))
+            assert [(scan.tolist(), pending) for scan, _, pending in scans] == [
+                ([1050, 1052, 1054, 1056, 1058], pending) for pending in (2, 1, 0)
+            ]
+            assert scans[0][1] < scans[1][1] < scans[2][1]
+            driver.activate()
+            driver.standby()
+            assert not scanner.laser
+            driver.reset()
+        driver.close()
 
 
 # --- the program ---

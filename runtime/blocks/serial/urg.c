@@ -2,8 +2,11 @@
 
 #include <flotilla/driver.h>
 #include <flotilla/sensor.h>
+#include <inttypes.h>
 #include <math.h>
+#include <stdarg.h>
 #include <stdio.h>
+#include <string.h>
 
 enum { OUT_RANGES, OUT_TIMESTAMP, OUT_FLAG };
 enum { STREAM, POLL };
@@ -26,7 +29,8 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct urg, last_step, .fallback = "725", .min = 0, .max = 9999, .summary = "last direction"),
     FL_PARAMETER(struct urg, cluster, .fallback = "1", .min = 1, .max = 99,
                  .summary = "steps that make one point, the shortest of them"),
-    FL_PARAMETER(struct urg, skip, .fallback = "0", .min = 0, .max = 9, .summary = "scans left out between two"),
+    FL_PARAMETER(struct urg, skip, .fallback = "0", .min = 0, .max = 9,
+                 .summary = "scans left out between two; `timeout` has to be longer than the pause"),
     FL_PARAMETER(struct urg, characters, .fallback = "3", .min = 2, .max = 3,
                  .summary = "of a point on the wire: 2 (up to 4.095 m) or 3"),
     FL_PARAMETER(struct urg, precision, .fallback = "double", .choices = "double|single", .summary = "of `ranges`"),
@@ -60,56 +64,226 @@ static struct urg_request request_of(const struct urg *urg)
     };
 }
 
-/* --- the conversation: stop what still streams, the new protocol, the laser, the scans --- */
+/* --- the conversation: find the rate, stop what still streams, the new protocol, the laser, the scans --- */
 
-enum { PATIENCE_MS = 500 }; /* five turns of the scanner: it was switched on anew, or refused */
+enum {
+    TURN_MS = 100,   /* of the slowest scanners, 600 rpm */
+    SPARE_TURNS = 4, /* a scan that is later by so many does not come any more: the scanner was switched on anew */
+    ANSWER_MS = 150, /* of silence, until a scanner that did not answer is taken for absent; twice as much and four
+                        times as much when it is at no rate */
+    LONGER = 2,      /* doublings of it */
+    BUSY_MS = 2000,  /* the same, although bytes come: a scan that was on its way takes a second at 19,200 Bd */
+    SETTLE_MS = 200, /* until a scanner has changed its rate; urg_library waits 150 ms */
+    REFUSED_MS = 1000,
+    REASON_TEXT = 128,
+};
 
-enum stage { STOPPING, SWITCHING, LIGHTING, SCANNING };
+/* After the parameter, which is 0 here. RS-232 scanners leave the works with the first; order as in urg_library. */
+static const int64_t bauds[] = {0, 19200, 57600, 115200, 250000, 500000, 750000, 38400};
+
+/* What was said last. WAITING: nothing, for a while. */
+enum stage { WAITING, QUITTING, LEAVING, RESETTING, SWITCHING, SPEEDING, LIGHTING, SCANNING };
 
 struct parser {
     struct urg_parser frames;
-    uint8_t stage;
-    uint16_t replied;
-    bool scanned; /* since the last question */
+    const struct urg *urg;
+    uint8_t stage, rate, rounds; /* rate: index in `bauds`; rounds: of all rates without an answer */
+    uint8_t refusals;            /* of QT */
+    bool slower;                 /* it refuses the parameter's rate */
+    bool scanned;                /* since the last question */
+    bool replied;                /* likewise, by this: */
+    struct urg_reply answer;
+    int64_t asked_ns;
+    int wait_ms;
+    char asked[URG_COMMAND + 1];
+    bool wrong; /* since the last call of take_reason */
+    char reason[REASON_TEXT];
 };
+
+__attribute__((format(printf, 2, 3))) static void complain(struct parser *self, const char *format, ...)
+{
+    va_list arguments;
+    va_start(arguments, format);
+    vsnprintf(self->reason, sizeof self->reason, format, arguments);
+    va_end(arguments);
+    self->wrong = true;
+}
+
+static void judge(struct parser *self, const struct urg_reply *reply)
+{
+    const char *meaning = urg_meaning(reply);
+    if ((reply->spoilt || !*reply->status) && !self->wrong)
+        complain(self, "wrong checksum or length in an answer: check the cable");
+    else if (*reply->status && meaning)
+        complain(self, "the scanner answers %.2s by status %s: %s", reply->echo, reply->status, meaning);
+}
 
 static bool feed(void *parser, uint8_t byte, void *sample)
 {
     struct parser *self = parser;
+    uint16_t replies = self->frames.replies;
     bool complete = urg_feed(&self->frames, byte, sample);
     self->scanned |= complete;
+    if (self->frames.replies == replies || strcmp(self->frames.reply.echo, self->asked) != 0)
+        return complete;
+    self->replied = true;
+    self->answer = self->frames.reply;
+    if (self->stage == LIGHTING || self->stage == SCANNING)
+        judge(self, &self->answer);
     return complete;
 }
 
-static size_t say(const char *command, uint8_t *out, size_t size)
+static int64_t baud_of(const void *parser)
 {
-    return (size_t)snprintf((char *)out, size, "%s\n", command);
+    return bauds[((const struct parser *)parser)->rate];
+}
+
+static const char *take_reason(void *parser, const void *given)
+{
+    (void)given;
+    struct parser *self = parser;
+    bool wrong = self->wrong;
+    self->wrong = false;
+    return wrong ? self->reason : NULL;
+}
+
+static size_t say(struct parser *self, enum stage stage, uint8_t *out, size_t size)
+{
+    static const char *const commands[] = {
+        [QUITTING] = "QT", [LEAVING] = "TM2", [RESETTING] = "RS", [SWITCHING] = "SCIP2.0", [LIGHTING] = "BM",
+    };
+    self->stage = (uint8_t)stage;
+    self->asked_ns = fl_now_ns();
+    self->scanned = self->replied = false;
+    if (stage == SCANNING)
+        memcpy(self->asked, self->frames.command, sizeof self->asked);
+    else if (stage == SPEEDING)
+        snprintf(self->asked, sizeof self->asked, "SS%06u", (unsigned)self->urg->baud % 1000000u);
+    else
+        snprintf(self->asked, sizeof self->asked, "%s", stage == WAITING ? "" : commands[stage]);
+    /* An empty line ends half a command that the scanner may have heard before, and has no answer of its own. */
+    return stage == WAITING ? 0
+                            : (size_t)snprintf((char *)out, size, "%s%s\n", stage == QUITTING ? "\n" : "", self->asked);
+}
+
+/* Say nothing for a while, and begin anew at the parameter's rate. The laser is off. */
+static size_t pause_for(struct parser *self, int wait_ms, uint8_t *out, size_t size)
+{
+    self->wait_ms = wait_ms;
+    self->rate = 0;
+    return say(self, WAITING, out, size);
+}
+
+static size_t begin(struct parser *self, unsigned rate, uint8_t *out, size_t size)
+{
+    const struct urg_request request = request_of(self->urg);
+    urg_expect(&self->frames, &request);
+    self->refusals = 0;
+    self->rate = (uint8_t)rate;
+    return say(self, QUITTING, out, size);
+}
+
+static size_t try_next_rate(struct parser *self, uint8_t *out, size_t size)
+{
+    unsigned rate = self->rate;
+    do {
+        rate = (rate + 1) % (sizeof bauds / sizeof bauds[0]);
+    } while (bauds[rate] == self->urg->baud);
+    if (!rate && self->rounds < LONGER)
+        self->rounds++;
+    return begin(self, rate, out, size);
+}
+
+/* It stopped, and speaks SCIP 2.0. The laser is lit last: until then nothing has to be switched off. */
+static size_t go_on(struct parser *self, uint8_t *out, size_t size)
+{
+    self->rounds = 0;
+    return say(self, self->rate && !self->slower ? SPEEDING : LIGHTING, out, size);
+}
+
+static size_t refused_to_quit(struct parser *self, const struct urg_reply *reply, uint8_t *out, size_t size)
+{
+    self->refusals++;
+    if (!*reply->status) {
+        judge(self, reply);
+        return say(self, QUITTING, out, size);
+    }
+    if (!reply->status[1]) /* SCIP 1.1 */
+        return say(self, SWITCHING, out, size);
+    if (self->refusals == 1) /* it adjusts the time, and obeys nothing else */
+        return say(self, LEAVING, out, size);
+    if (self->refusals == 2)
+        return say(self, RESETTING, out, size);
+    judge(self, reply);
+    return pause_for(self, REFUSED_MS, out, size);
+}
+
+static size_t answered(struct parser *self, uint8_t *out, size_t size)
+{
+    const struct urg_reply *reply = &self->answer;
+    bool well = *reply->status && !urg_meaning(reply);
+    switch ((enum stage)self->stage) {
+    case QUITTING:
+        return well && reply->status[1] ? go_on(self, out, size) : refused_to_quit(self, reply, out, size);
+    case LEAVING:
+    case RESETTING:
+        return say(self, QUITTING, out, size);
+    case SWITCHING:
+        if (well || reply->status[1])
+            return go_on(self, out, size);
+        complain(self, "the scanner speaks SCIP 1.1 and refuses SCIP2.0: its firmware is older than 3.0");
+        return pause_for(self, REFUSED_MS, out, size);
+    case SPEEDING:
+        if (well || strcmp(reply->status, "03") == 0)
+            return pause_for(self, SETTLE_MS, out, size);
+        if (!*reply->status)
+            return begin(self, 0, out, size);
+        self->slower = true;
+        complain(self, "the scanner has %" PRId64 " Bd, and answers %s by status %s: set `baud` to that",
+                 bauds[self->rate], self->asked, reply->status);
+        return say(self, LIGHTING, out, size);
+    case LIGHTING:
+        return say(self, SCANNING, out, size);
+    case WAITING:
+    case SCANNING:
+        break;
+    }
+    return 0;
+}
+
+static size_t go_on_scanning(struct parser *self, int silent_ms, uint8_t *out, size_t size)
+{
+    const struct urg *urg = self->urg;
+    bool streams = urg->mode == STREAM;
+    /* At the rate that it had, so that the laser goes off if it is lit yet. */
+    if (silent_ms > TURN_MS * (SPARE_TURNS + 1 + (streams ? (int)urg->skip : 0)))
+        return begin(self, self->rate, out, size);
+    bool ask = !streams && (self->scanned || (self->replied && self->answer.spoilt));
+    return ask ? say(self, SCANNING, out, size) : 0;
 }
 
 static size_t converse(void *parser, const void *given, int silent_ms, uint8_t *out, size_t size)
 {
-    const struct urg_request request = request_of(given);
     struct parser *self = parser;
+    self->urg = given;
     if (silent_ms == FL_SERIAL_CLOSING)
-        return say("QT", out, size);
-    if (silent_ms == FL_SERIAL_OPENED || (self->stage == SCANNING && silent_ms > PATIENCE_MS)) {
-        urg_expect(&self->frames, &request);
-        self->replied = 0;
-        self->stage = STOPPING;
-        return say("QT", out, size);
-    }
-    if (self->stage == SCANNING) {
-        bool ask = !request.stream && self->scanned;
-        self->scanned = false;
-        return ask ? say(self->frames.command, out, size) : 0;
-    }
-    /* A scanner that knows only the old protocol answers QT in its own way, or not at all. */
-    bool replied = self->replied != self->frames.replies;
-    self->replied = self->frames.replies;
-    if (!replied && silent_ms == 0)
+        return say(self, QUITTING, out, size);
+    if (silent_ms == FL_SERIAL_OPENED)
+        return begin(self, 0, out, size);
+    int64_t asked_ms = (fl_now_ns() - self->asked_ns) / 1000000;
+    if (asked_ms < silent_ms)
+        silent_ms = (int)asked_ms;
+    if (self->stage == SCANNING)
+        return go_on_scanning(self, silent_ms, out, size);
+    if (self->stage == WAITING)
+        return asked_ms > self->wait_ms ? begin(self, 0, out, size) : 0;
+    if (self->replied)
+        return answered(self, out, size);
+    if (silent_ms < ANSWER_MS << self->rounds && asked_ms < BUSY_MS)
         return 0;
-    self->stage++;
-    return say(self->stage == SWITCHING ? "SCIP2.0" : self->stage == LIGHTING ? "BM" : self->frames.command, out, size);
+    if (self->stage == QUITTING)
+        return try_next_rate(self, out, size);
+    return begin(self, self->stage == SPEEDING ? 0 : self->rate, out, size);
 }
 
 static const struct fl_serial_protocol protocol = {
@@ -117,6 +291,8 @@ static const struct fl_serial_protocol protocol = {
     .sample_size = sizeof(struct urg_scan),
     .feed = feed,
     .send = converse,
+    .baud = baud_of,
+    .reason = take_reason,
 };
 
 /* --- the block --- */
@@ -213,7 +389,9 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(urg) = {
     .abi = FL_ABI,
     .name = "urg",
-    .summary = "Hokuyo laser scanner that speaks SCIP 2.0 (URG-04LX, UTM-30LX, ...)",
+    .summary =
+        "Hokuyo laser scanner that speaks SCIP 2.0 (URG-04LX, UTM-30LX, ...); one that has another rate is found, "
+        "and told to take `baud`",
     .source = "Hokuyo communication protocol specification for SCIP 2.0, C-42-03320B",
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct urg),

@@ -26,6 +26,16 @@ struct urg_scan {
     uint32_t millimetres[URG_POINTS]; /* short ones are error codes */
 };
 
+/* What a reply says of the command that it answers. */
+struct urg_reply {
+    char echo[URG_COMMAND + 1]; /* the command; empty of a longer line */
+    char status[3];             /* two characters, one of SCIP 1.1, none with a wrong checksum */
+    bool spoilt;                /* a scan that was asked for, and lost */
+};
+
+/* What a status means, and what to do about it, as the answer to a command of SCIP 2.0. Static; NULL: all is well. */
+const char *urg_meaning(const struct urg_reply *reply);
+
 /* Points of a scan. */
 uint16_t urg_points(const struct urg_request *request);
 
@@ -44,7 +54,9 @@ struct urg_parser {
     uint8_t length, state;
     uint8_t partial_characters; /* of a point that goes on in the next block */
     uint32_t partial;
-    uint16_t replies; /* complete ones of any kind, also refusals: counted up, and round */
+    uint16_t replies;       /* complete ones of any kind, also refusals: counted up, and round */
+    struct urg_reply reply; /* the newest of them, and what came since of the next */
+    bool asked;             /* its echo is the command */
     struct urg_scan scan;
 };
 

@@ -103,8 +103,15 @@ struct fl_serial_protocol {
 
     /* What to send now, at most `size` bytes into `out`; their number. NULL where nothing is ever sent. Called before
      * the first byte is fed (silent_ms is FL_SERIAL_OPENED), after each batch of bytes (0), about every 100 ms of
-     * silence with its length so far, and before an orderly end (FL_SERIAL_CLOSING). */
+     * silence with its length so far, and before an orderly end (FL_SERIAL_CLOSING), which comes after whatever was
+     * being sent when the end was asked for, and has half a second for both. */
     size_t (*send)(void *parser, const void *parameters, int silent_ms, uint8_t *out, size_t size);
+
+    /* The rate to talk at from here on, in Bd; 0: the port's own parameter. Called after each `send`, before what that
+     * gave is sent, so what was sent earlier must have left: wait for its answer. When the rate changes, bytes that
+     * came and were not fed are dropped. At a rate that the port lacks no device answers. NULL: always the parameter.
+     */
+    int64_t (*baud)(const void *parser);
 
     /* Why bytes that were fed since the last call are no good measurement, and what to do about it: a wrong checksum,
      * another mode, a fault that the device tells. One line, which lasts until the next call; NULL: nothing is wrong.

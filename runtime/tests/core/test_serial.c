@@ -6,7 +6,9 @@
 #include <asm/termbits.h>
 #include <errno.h>
 #include <flotilla/driver.h>
+#include <pthread.h>
 #include <stdatomic.h>
+#include <sys/eventfd.h>
 #include <sys/ioctl.h>
 #include <sys/syscall.h>
 
@@ -30,6 +32,16 @@ int ioctl(int fd, unsigned long request, ...)
     if (request == TCGETS2 && pretended)
         ((struct termios2 *)argument)->c_ospeed = pretended;
     return result;
+}
+
+/* And the moment at which a thread is asked to return. */
+static _Atomic bool stopping;
+
+int eventfd_write(int fd, eventfd_t value)
+{
+    bool written = write(fd, &value, sizeof value) == sizeof value;
+    atomic_store(&stopping, true);
+    return written ? 0 : -1;
 }
 
 static const struct termios2 *settings_of(struct line *line, int64_t baud, int64_t data, int64_t stop, int parity)
@@ -92,13 +104,14 @@ enum { LOUD = 64 };
 
 struct probe {
     FL_SERIAL_MEMBERS;
-    int send; /* nothing; what it is called with; LOUD bytes at each batch */
+    int send; /* nothing; what it is called with; the same, but not in silence; LOUD bytes at each batch */
 };
-enum { SEND_NOTHING, SEND_REASON, SEND_LOUD };
+enum { SEND_NOTHING, SEND_REASON, SEND_ANSWER, SEND_LOUD };
 
 static const struct fl_parameter parameters[] = {
     FL_SERIAL_PARAMETERS(struct probe, "9600"),
-    FL_PARAMETER(struct probe, send, .fallback = "nothing", .choices = "nothing|reason|loud", .summary = "replies"),
+    FL_PARAMETER(struct probe, send, .fallback = "nothing", .choices = "nothing|reason|answer|loud",
+                 .summary = "replies"),
 };
 
 struct counted {
@@ -119,7 +132,7 @@ static size_t send_something(void *parser, const void *given, int silent_ms, uin
     memset(out, '.', size);
     if (probe->send == SEND_LOUD)
         return silent_ms == 0 ? LOUD : 0;
-    if (probe->send == SEND_NOTHING)
+    if (probe->send == SEND_NOTHING || (probe->send == SEND_ANSWER && silent_ms > 0))
         return 0;
     *out = silent_ms == FL_SERIAL_OPENED ? 'o' : silent_ms == FL_SERIAL_CLOSING ? 'c' : silent_ms == 0 ? 'b' : 's';
     return 1;
@@ -304,6 +317,84 @@ static void opens_a_stuck_port_anew(void **state)
     bench_destroy(&bench);
 }
 
+/* Whether the line holds all it can for a device that does not read: two buffers of the kernel, and a worker of its own
+ * moves bytes from one to the other. */
+static bool is_full(const struct line *line, int fd)
+{
+    enum { KEPT = 4095 };
+    static const char filling[KEPT] = "";
+    int kept;
+    bool refused = write(fd, filling, sizeof filling) < 0 && write(fd, filling, 1) < 0 && errno == EAGAIN;
+    assert_int_equal(ioctl(line->master, FIONREAD, &kept), 0);
+    return refused && kept >= KEPT;
+}
+
+static void fill(const struct line *line)
+{
+    int fd = open(line->path, O_WRONLY | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
+    assert_true(fd >= 0);
+    AWAIT(is_full(line, fd) && is_full(line, fd));
+    close(fd);
+}
+
+/* A device that reads on once the thread was asked to return: what it heard other than the filling. */
+static void *read_on(void *argument)
+{
+    const struct line *line = argument;
+    static char heard[16];
+    size_t count = 0;
+    AWAIT(atomic_load(&stopping));
+    while (count < sizeof heard - 1) {
+        char bytes[4096];
+        struct pollfd waiting = {.fd = line->master, .events = POLLIN};
+        ssize_t got = poll(&waiting, 1, AWAIT_MS) == 1 ? read(line->master, bytes, sizeof bytes) : -1;
+        for (ssize_t i = 0; i < got; i++)
+            if (bytes[i])
+                heard[count++] = bytes[i];
+        if (got <= 0 || (count && heard[count - 1] == 'c'))
+            break;
+    }
+    heard[count] = '\0';
+    return heard;
+}
+
+/* What makes a device safe is said last, and after whole commands: the laser goes off. */
+static void ends_in_order_although_it_was_writing(void **state)
+{
+    (void)state;
+    struct bench bench = bench_create(&newest, "answer");
+    assert_true(line_hears(&bench.line, "o"));
+    fill(&bench.line);
+    line_say(&bench.line, "x"); /* 'b' answers it, for which there is no room */
+    AWAIT(take_newest(&bench));
+    pthread_t device;
+    void *heard;
+    atomic_store(&stopping, false);
+    assert_int_equal(pthread_create(&device, NULL, read_on, &bench.line), 0);
+    fl_serial_stop(bench.serial);
+    assert_int_equal(pthread_join(device, &heard), 0);
+    assert_true(strcmp(heard, "bc") == 0 || strcmp(heard, "c") == 0); /* a slow computer gives 'b' up after a second */
+    line_unplug(&bench.line);
+    testbed_end(bench.block);
+}
+
+/* But a device that reads no more holds up no end. */
+static void ends_although_the_port_is_stuck(void **state)
+{
+    (void)state;
+    struct said said = said_begin();
+    struct bench bench = bench_create(&newest, "answer");
+    assert_true(line_hears(&bench.line, "o"));
+    fill(&bench.line);
+    line_say(&bench.line, "x");
+    AWAIT(take_newest(&bench));
+    fl_serial_stop(bench.serial);
+    assert_int_equal(said_times(&said, "takes no more bytes"), 1);
+    said_end(&said);
+    line_unplug(&bench.line);
+    testbed_end(bench.block);
+}
+
 static void says_once_why_it_cannot_open(void **state)
 {
     (void)state;
@@ -403,6 +494,8 @@ int main(void)
         cmocka_unit_test(sends_what_the_step_queues),
         cmocka_unit_test(says_why_it_sends),
         cmocka_unit_test(opens_a_stuck_port_anew),
+        cmocka_unit_test(ends_in_order_although_it_was_writing),
+        cmocka_unit_test(ends_although_the_port_is_stuck),
         cmocka_unit_test(says_once_why_it_cannot_open),
         cmocka_unit_test(says_a_protocols_reason_once),
         cmocka_unit_test(says_that_nothing_comes_or_nothing_of_use),
