@@ -77,7 +77,7 @@ def test_a_topic_between_two_tasks(start: Start) -> None:
 
 
 def test_stacks_of_dds_are_small(start: Start) -> None:
-    """Memory is locked, and stacks count in full; our own threads have 32 kB more, for handlers of signals. Seen to fail
+    """Memory is locked, and stacks count in full; our threads have 32 kB more, for handlers of signals. Seen to fail
     without the default that privilege_lock_memory sets."""
     sender = SENDER.format(parameters=PARAMETERS.format(domain=DOMAIN, more=""))
     with start("sender", sender, "out.written") as telling:
