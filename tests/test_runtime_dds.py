@@ -77,13 +77,14 @@ def test_a_topic_between_two_tasks(start: Start) -> None:
 
 
 def test_stacks_of_dds_are_small(start: Start) -> None:
-    """Memory is locked, and stacks count in full. Seen to fail without the default that privilege_lock_memory sets."""
+    """Memory is locked, and stacks count in full; our threads have 32 kB more, for handlers of signals. Seen to fail
+    without the default that privilege_lock_memory sets."""
     sender = SENDER.format(parameters=PARAMETERS.format(domain=DOMAIN, more=""))
     with start("sender", sender, "out.written") as telling:
         telling.until(lambda row: row["step"] >= 10)
         own = Path(f"/proc/{telling.process.pid}")
         threads = [path.read_text().strip() for path in own.glob("task/*/comm")]
         spans = [line.split()[0].split("-") for line in (own / "maps").read_text().splitlines() if " rw-p " in line]
-    stacks = sum(int(end, 16) - int(begin, 16) == 256 << 10 for begin, end in spans)
+    stacks = sum(int(end, 16) - int(begin, 16) in (256 << 10, 288 << 10) for begin, end in spans)
     assert "recvUC" in threads
-    assert stacks >= len(threads) - 1, f"{stacks} stacks of 256 kB for {threads}"
+    assert stacks >= len(threads) - 1, f"{stacks} stacks of that size for {threads}"

@@ -7,6 +7,8 @@
 #include <errno.h>
 #include <flotilla/block.h>
 #include <sched.h>
+#include <semaphore.h>
+#include <signal.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -186,24 +188,59 @@ void block_destroy(struct fl_block *block)
     free(block);
 }
 
+enum { HANDLERS_STACK_BYTES = 32 * 1024 }; /* frames of several handlers, and what `safe` needs */
+
+void *fl_service_enter(void *(*enter)(void *), void *argument)
+{
+    unsigned char reserve[HANDLERS_STACK_BYTES]; /* at the far end of the stack from where that overflows */
+    stack_t before;
+    sigaltstack(&(stack_t){.ss_sp = reserve, .ss_size = sizeof reserve}, &before);
+    void *result = enter(argument);
+    sigaltstack(&before, NULL);
+    return result;
+}
+
+struct starting {
+    void *(*enter)(void *);
+    void *argument;
+    sem_t taken;
+};
+
+static void *enter_thread(void *argument)
+{
+    struct starting *starting = argument;
+    void *(*enter)(void *) = starting->enter;
+    void *context = starting->argument;
+    sem_post(&starting->taken); /* it is gone now */
+    return fl_service_enter(enter, context);
+}
+
 int fl_service_thread(struct fl_service *service, pthread_t *thread, const char *name, void *(*enter)(void *),
                       void *argument)
 {
     pthread_attr_t attributes;
+    struct starting starting = {enter, argument, {{0}}};
+    size_t stack = 0;
     int error = pthread_attr_init(&attributes);
     if (error)
         return error;
+    if (pthread_attr_getstacksize(&attributes, &stack) == 0)
+        pthread_attr_setstacksize(&attributes, stack + HANDLERS_STACK_BYTES);
+    sem_init(&starting.taken, 0, 0);
     if (service->priority) {
         pthread_attr_setinheritsched(&attributes, PTHREAD_EXPLICIT_SCHED);
         pthread_attr_setschedpolicy(&attributes, SCHED_FIFO);
         pthread_attr_setschedparam(&attributes, &(struct sched_param){.sched_priority = service->priority});
     }
-    error = pthread_create(thread, &attributes, enter, argument);
+    error = pthread_create(thread, &attributes, enter_thread, &starting);
     pthread_attr_destroy(&attributes);
     if (!error) {
+        while (sem_wait(&starting.taken) < 0)
+            continue; /* interrupted */
         char shown[16];
         snprintf(shown, sizeof shown, "%s", name);
         pthread_setname_np(*thread, shown);
     }
+    sem_destroy(&starting.taken);
     return error;
 }

@@ -3,6 +3,7 @@
 
 #include "block.h"
 #include "privilege.h"
+#include "safety.h"
 #include "schedule.h"
 #include "status.h"
 #include "watch.h"
@@ -39,6 +40,8 @@ struct executive {
     int ended_fd;
     _Atomic bool stop, ended;
     struct status *status; /* for all other threads */
+    int signal;            /* that asked for the end; 0: none did */
+    int output_error;      /* errno of stdout */
 };
 
 /* --- life of blocks --- */
@@ -97,14 +100,18 @@ unsigned executive_make_safe(struct task *task)
         if (!type->safe)
             continue;
         member->started = true;
-        if (type->start && type->start(member->block) != FL_OK) {
-            fprintf(stderr, "%s: %s\n", member->block->name, member->block->service->failure);
-            failures++;
-        } else {
+        member->failed = type->start && type->start(member->block) != FL_OK;
+        if (!member->failed)
             type->safe(member->block);
-        }
     }
     terminate_blocks(task);
+    /* Now that no output waits for whoever reads it. */
+    for (size_t i = 0; i < task->count; i++) {
+        if (!task->members[i].failed)
+            continue;
+        fprintf(stderr, "%s: %s\n", task->members[i].block->name, task->members[i].block->service->failure);
+        failures++;
+    }
     return failures;
 }
 
@@ -188,6 +195,7 @@ static void *control(void *argument)
     const struct run_options *options = executive->options;
     struct run_result *result = executive->result;
     int64_t in_a_row = 0, period_ns = executive->task->period_ns;
+    safety_step_begin();
     touch_stack();
     /* By multiples of the period, so that tasks of one computer keep their phases to each other. */
     int64_t expected_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
@@ -216,6 +224,7 @@ static void *control(void *argument)
             break;
     }
     make_outputs_safe(executive->task);
+    safety_step_end();
     atomic_store(&executive->ended, true);
     eventfd_write(executive->ended_fd, 1);
     return NULL;
@@ -223,18 +232,15 @@ static void *control(void *argument)
 
 /* --- guarding thread --- */
 
-/* A step that never ends: outputs to their reset state from here, and leave the thread where it is. */
-static void abandon(struct executive *executive)
+/* A step that never ends. */
+static _Noreturn void abandon(const struct executive *executive)
 {
-    char text[128];
-    snprintf(text, sizeof text, "no step for ten periods and a second, after step %" PRIu64,
-             status_steps(executive->status));
-    make_outputs_safe(executive->task);
-    /* Others have to run for what follows, and the thread may be all that does. */
-    pthread_setschedparam(executive->control, SCHED_OTHER, &(struct sched_param){0});
-    fprintf(stderr, "flotilla: %s: %s; outputs are in their reset state\n", executive->task->name, text);
-    fflush(NULL);
-    _exit(1);
+    char text[512];
+    snprintf(text, sizeof text,
+             "flotilla: %s: no step for ten periods and a second, after step %" PRIu64
+             "; outputs are in their reset state\n",
+             executive->task->name, status_steps(executive->status));
+    safety_abandon(text);
 }
 
 /* Until the control thread has ended, or cannot. */
@@ -259,6 +265,45 @@ static void *guard(void *argument)
 
 /* --- serving thread --- */
 
+/* A reader that has gone ends the task as a signal does. */
+static void print_watched(struct executive *executive)
+{
+    int error = executive->watch ? watch_print(executive->watch) : 0;
+    if (error && !executive->output_error) {
+        executive->output_error = error;
+        atomic_store(&executive->stop, true);
+    }
+}
+
+static void take_signal(struct executive *executive, int signals_fd)
+{
+    struct signalfd_siginfo received;
+    if (read(signals_fd, &received, sizeof received) != sizeof received)
+        return;
+    if (!executive->signal)
+        executive->signal = (int)received.ssi_signo;
+    atomic_store(&executive->stop, true);
+}
+
+/* Why it ended, if nothing was wrong with the steps. */
+static void end_as_asked(const struct executive *executive)
+{
+    static const int asking[] = {SIGTERM, SIGINT, SIGHUP, SIGQUIT, SIGTSTP};
+    char text[128];
+    bool asked = !executive->signal;
+    for (size_t i = 0; i < sizeof asking / sizeof *asking; i++)
+        asked |= executive->signal == asking[i];
+    if (!asked) {
+        const char *name = sigabbrev_np(executive->signal);
+        snprintf(text, sizeof text, "signal %d%s%s came", executive->signal, name ? ", SIG" : "", name ? name : "");
+        end(executive->result, ENDING_FAILED, NULL, text);
+    } else if (executive->output_error && executive->output_error != EPIPE) {
+        snprintf(text, sizeof text, "what is watched cannot be printed: %s", strerror(executive->output_error));
+        end(executive->result, ENDING_FAILED, NULL, text);
+    }
+    end(executive->result, ENDING_ASKED, NULL, "a signal asked for it, or nobody reads what is watched any more");
+}
+
 /* Until the control thread has ended. */
 static void serve(struct executive *executive, int signals_fd)
 {
@@ -270,13 +315,9 @@ static void serve(struct executive *executive, int signals_fd)
     while (!atomic_load(&executive->ended)) {
         struct pollfd waiting[] = {{.fd = signals_fd, .events = POLLIN}, {.fd = executive->ended_fd, .events = POLLIN}};
         poll(waiting, 2, (int)wake_ms);
-        if (executive->watch)
-            watch_print(executive->watch);
-        if (waiting[0].revents) {
-            struct signalfd_siginfo received;
-            if (read(signals_fd, &received, sizeof received) == sizeof received)
-                atomic_store(&executive->stop, true);
-        }
+        print_watched(executive);
+        if (waiting[0].revents)
+            take_signal(executive, signals_fd);
         int64_t now_ns = fl_now_ns();
         uint64_t steps = status_steps(executive->status);
         /* Only a task that steps may say that it is alive. */
@@ -293,10 +334,7 @@ static void serve(struct executive *executive, int signals_fd)
 static int block_signals(void)
 {
     sigset_t signals;
-    sigemptyset(&signals);
-    sigaddset(&signals, SIGTERM);
-    sigaddset(&signals, SIGINT);
-    sigaddset(&signals, SIGHUP);
+    safety_orderly_signals(&signals);
     pthread_sigmask(SIG_BLOCK, &signals, NULL);
     return signalfd(-1, &signals, SFD_CLOEXEC);
 }
@@ -326,48 +364,59 @@ static int start_threads(struct executive *executive, int priority, pthread_t *g
     return error;
 }
 
-void executive_run(struct task *task, const struct run_options *options, struct run_result *result)
+static void *run(void *argument)
 {
+    struct executive *executive = argument;
+    struct task *task = executive->task;
+    const struct run_options *options = executive->options;
+    struct run_result *result = executive->result;
     pthread_t guarding;
-    struct executive executive = {.task = task, .options = options, .result = result};
-    *result = (struct run_result){0};
     int signals_fd = block_signals();
-    executive.ended_fd = eventfd(0, EFD_CLOEXEC);
+    safety_begin(task);
+    executive->ended_fd = eventfd(0, EFD_CLOEXEC);
     if (options->watched_count)
-        executive.watch = watch_create(options->watched, options->watched_count);
-    executive.schedule = schedule_create(task);
-    executive.change = options->tuner ? tuner_change(options->tuner) : NULL;
+        executive->watch = watch_create(options->watched, options->watched_count);
+    executive->schedule = schedule_create(task);
+    executive->change = options->tuner ? tuner_change(options->tuner) : NULL;
     if (!options->no_wait)
         privilege_lock_memory();
     int priority = options->no_wait ? 0 : privilege_priority(task->priority, "steps will be late under load");
     for (size_t i = 0; i < task->count; i++)
         task->members[i].block->service->priority = priority ? priority - 1 : 0;
     if (start_blocks(task, result)) {
-        executive.status = status_create(task);
-        int error = start_threads(&executive, priority, &guarding);
+        executive->status = status_create(task);
+        int error = start_threads(executive, priority, &guarding);
         if (error) {
             end(result, ENDING_FAILED, NULL, strerror(error));
         } else {
-            serve_parameters(&executive);
+            serve_parameters(executive);
             sd_notify(0, "READY=1");
-            serve(&executive, signals_fd);
+            serve(executive, signals_fd);
             sd_notify(0, "STOPPING=1");
-            pthread_join(executive.control, NULL);
+            pthread_join(executive->control, NULL);
             pthread_join(guarding, NULL);
             if (options->tuner)
                 tuner_stop(options->tuner);
-            if (executive.watch)
-                watch_print(executive.watch);
+            print_watched(executive);
         }
     }
-    end(result, ENDING_ASKED, NULL, "a signal asked for it");
+    end_as_asked(executive);
     terminate_blocks(task);
-    schedule_report(executive.schedule, task);
-    schedule_destroy(executive.schedule);
-    status_destroy(executive.status);
-    watch_destroy(executive.watch);
-    close(executive.ended_fd);
+    safety_end();
+    schedule_report(executive->schedule, task);
+    schedule_destroy(executive->schedule);
+    status_destroy(executive->status);
+    watch_destroy(executive->watch);
+    close(executive->ended_fd);
     close(signals_fd);
+    return NULL;
+}
+
+void executive_run(struct task *task, const struct run_options *options, struct run_result *result)
+{
+    struct executive executive = {.task = task, .options = options, .result = result};
+    *result = (struct run_result){0};
+    fl_service_enter(run, &executive);
 }
 
 void executive_write_statistics(const struct task *task, const struct run_result *result, FILE *out)

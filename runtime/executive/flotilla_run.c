@@ -7,6 +7,7 @@
 #include <getopt.h>
 #include <inttypes.h>
 #include <limits.h>
+#include <signal.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -177,6 +178,7 @@ int main(int argc, char **argv)
     struct registry registry = {0};
     struct task task;
     int status = 0;
+    signal(SIGPIPE, SIG_IGN); /* a reader that has gone must not end what moves a robot */
     if (!parse(&command, argc, argv))
         return 2;
     struct problems problems = {.file = command.path, .out = stderr};

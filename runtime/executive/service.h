@@ -22,6 +22,10 @@ struct fl_service {
     bool inner_failed;
 };
 
+/* enter(argument), with a stack beside it for handlers of signals, so that they run when the thread's own is used up.
+ */
+void *fl_service_enter(void *(*enter)(void *), void *argument);
+
 /* Start a thread named after the block, at the service's priority where that is allowed; 0 or an errno. */
 int fl_service_thread(struct fl_service *service, pthread_t *thread, const char *name, void *(*enter)(void *),
                       void *argument);

@@ -13,9 +13,9 @@ struct took {
 struct member {
     struct fl_block *block;
     int64_t every, offset;
-    struct took took; /* by its steps, after a run */
-    bool started;
-    bool incomplete; /* its ports are not known, because its parameters are wrong */
+    struct took took;     /* by its steps, after a run */
+    bool started, failed; /* `failed`: its start */
+    bool incomplete;      /* its ports are not known, because its parameters are wrong */
 };
 
 struct task {

@@ -1,6 +1,7 @@
 #define _GNU_SOURCE
 #include "watch.h"
 
+#include <errno.h>
 #include <flotilla/ring.h>
 #include <inttypes.h>
 #include <math.h>
@@ -135,7 +136,7 @@ static void print_value(enum fl_type type, const unsigned char *at)
     }
 }
 
-void watch_print(struct watch *watch)
+int watch_print(struct watch *watch)
 {
     while (fl_ring_take(&watch->ring, watch->taken)) {
         const unsigned char *at = watch->taken->values;
@@ -153,5 +154,7 @@ void watch_print(struct watch *watch)
         }
         printf("}\n");
     }
-    fflush(stdout);
+    errno = 0;
+    bool failed = fflush(stdout) != 0 || ferror(stdout);
+    return !failed ? 0 : errno ? errno : EPIPE;
 }

@@ -13,7 +13,8 @@ void watch_destroy(struct watch *watch); /* NULL is allowed */
  * none. */
 void watch_put(struct watch *watch, uint64_t step, int64_t release_ns, bool wait);
 
-/* Print what has come: {"step": 0, "release_ns": 0, "lost": 0, "block.port": 1.5} */
-void watch_print(struct watch *watch);
+/* Print what has come: {"step": 0, "release_ns": 0, "lost": 0, "block.port": 1.5}. 0, or an errno once
+ * something could not be printed. */
+int watch_print(struct watch *watch);
 
 #endif

@@ -223,6 +223,8 @@ static void safe(struct fl_block *block)
     struct state *state = block->state;
     if (!state->permitted)
         return;
+    /* A thread that was begun before `start` has no ports, and may be the one whose failure ends the task. */
+    port_space->permit(state->base, PORTS, true);
     state->commanded = state->reset;
     write_relays(state, state->reset);
 }

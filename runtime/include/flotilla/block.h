@@ -9,7 +9,8 @@
  *   initialize   sets state and outputs as of time zero; not timed
  *   step         once each period of the block, in real time: no allocation, no call that may block
  *   await        where the block may be a task's `trigger`: waits, in real time, for what the next step shall take
- *   safe         an actuator's outputs go to their reset state; in real time, at any moment after start
+ *   safe         an actuator's outputs go to their reset state; in real time, at any moment after start, in any thread,
+ *                also in a signal handler while a step was left halfway: only what signal-safety(7) allows
  *   terminate    outputs to their reset state, devices closed; also after a start that failed halfway
  *
  * configure, start, initialize and step return 0, or FL_FAILED after fl_fail() has said why.

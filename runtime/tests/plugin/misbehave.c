@@ -1,6 +1,8 @@
 /* Plug-in with blocks that do what a block must not, and one that leaves a trace: for the tests of the executive. */
 #include <fcntl.h>
 #include <flotilla/block.h>
+#include <flotilla/driver.h>
+#include <stdatomic.h>
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
@@ -16,38 +18,122 @@ struct misbehave {
 };
 
 static const struct fl_parameter misbehave_parameters[] = {
-    FL_PARAMETER(struct misbehave, manner, .choices = "fail|hang|late|allocate|start-fail"),
+    FL_PARAMETER(struct misbehave, manner,
+                 .choices = "fail|hang|late|allocate|start-fail|fault|abort|exit|"
+                            "overflow|thread-fault|thread-exit|safe-fault|safe-hang"),
     FL_PARAMETER(struct misbehave, from, .fallback = "0"),
     FL_PARAMETER(struct misbehave, until, .fallback = "1000000000"),
     FL_PARAMETER(struct misbehave, late_s, .fallback = "0.025"),
 };
 
+enum {
+    FAIL,
+    HANG,
+    LATE,
+    ALLOCATE,
+    START_FAIL,
+    FAULT,
+    ABORT,
+    EXIT,
+    OVERFLOW,
+    THREAD_FAULT,
+    THREAD_EXIT,
+    SAFE_FAULT, /* a fault in the step, and another in what follows */
+    SAFE_HANG,
+};
+
+struct misbehaving {
+    struct fl_driver *driver;
+    atomic_bool now; /* for the thread */
+};
+
+static void fault(void)
+{
+    volatile int *volatile nowhere = NULL;
+    *nowhere = 1;
+}
+
+static int overflow(volatile int depth)
+{
+    volatile char large[4096] = {0};
+    return depth < 0 ? 0 : overflow(depth + 1) + large[depth % 4096];
+}
+
+static void thread(struct fl_driver *driver, void *context)
+{
+    struct fl_block *block = context;
+    const struct misbehave *parameters = block->parameters;
+    struct misbehaving *state = block->state;
+    while (fl_driver_wait(driver, -1, false, 1) == 0) {
+        if (!state->now)
+            continue;
+        if (parameters->manner == THREAD_EXIT)
+            exit(0);
+        fault();
+    }
+}
+
 static int misbehave_start(struct fl_block *block)
 {
     const struct misbehave *parameters = block->parameters;
-    return parameters->manner == 4 ? fl_fail(block, "the device is on fire") : FL_OK;
+    struct misbehaving *state = block->state;
+    if (parameters->manner == START_FAIL)
+        return fl_fail(block, "the device is on fire");
+    if (parameters->manner == THREAD_FAULT || parameters->manner == THREAD_EXIT)
+        state->driver = fl_driver_start(block, thread, block);
+    return FL_OK;
+}
+
+static void misbehave_safe(struct fl_block *block)
+{
+    const struct misbehave *parameters = block->parameters;
+    if (parameters->manner == SAFE_FAULT)
+        fault();
+    while (parameters->manner == SAFE_HANG)
+        pause();
+}
+
+static void misbehave_terminate(struct fl_block *block)
+{
+    const struct misbehaving *state = block->state;
+    fl_driver_stop(state->driver);
 }
 
 static int misbehave_step(struct fl_block *block)
 {
     const struct misbehave *parameters = block->parameters;
+    struct misbehaving *state = block->state;
     if ((int64_t)block->step < parameters->from || (int64_t)block->step >= parameters->until)
         return FL_OK;
     switch (parameters->manner) {
-    case 0:
+    case FAIL:
         return fl_fail(block, "failed as asked in step %d", (int)block->step);
-    case 1:
+    case HANG:
         for (;;)
             pause();
-    case 2:
+    case LATE:
         for (int64_t end_ns = fl_now_ns() + (int64_t)(parameters->late_s * 1e9); fl_now_ns() < end_ns;)
             continue;
         return FL_OK;
-    default: {
+    case ABORT:
+    case SAFE_HANG:
+        abort();
+    case EXIT:
+        exit(0);
+    case OVERFLOW:
+        return overflow(0);
+    case THREAD_FAULT:
+    case THREAD_EXIT:
+        state->now = true;
+        return FL_OK;
+    case ALLOCATE: {
         void *volatile memory = malloc(100);
         free(memory);
         return FL_OK;
     }
+    default:
+        fault();
+        return FL_OK;
     }
 }
 
@@ -56,8 +142,11 @@ FL_BLOCK(misbehave) = {
     .name = "misbehave",
     FL_TABLE(parameter, misbehave_parameters),
     .parameters_size = sizeof(struct misbehave),
+    .state_size = sizeof(struct misbehaving),
     .start = misbehave_start,
     .step = misbehave_step,
+    .safe = misbehave_safe,
+    .terminate = misbehave_terminate,
 };
 
 /* An actuator whose device is a file: "on" by steps, "reset" by safe and terminate. */

@@ -1,0 +1,148 @@
+#define _GNU_SOURCE
+#include "safety.h"
+
+#include <errno.h>
+#include <stdatomic.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/types.h>
+#include <time.h>
+#include <unistd.h>
+
+enum {
+    LIMIT_S = 1,              /* from the first `safe` to the end of the process */
+    PARK_NS = 20 * 1000000,   /* a thread that waits in the kernel cannot be parked, nor can it run a step */
+    PARK_POLL_NS = 50 * 1000, /* on one processor the thread gets it meanwhile */
+};
+
+/* One signal for what this file asks of itself: from tgkill() it parks a thread, from the timer it ends the process. */
+#define OWN_SIGNAL SIGRTMIN
+
+static const int fatal_signals[] = {SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGABRT, SIGSYS, SIGTRAP};
+#define FATAL_SIGNALS (sizeof fatal_signals / sizeof *fatal_signals)
+
+/* Of the process, as signals are. */
+static struct {
+    _Atomic(struct task *) task; /* NULL: nothing is to be made safe */
+    pid_t process;               /* a child that a block forks has the handlers, but not the task */
+    timer_t limit;
+    _Atomic size_t left; /* blocks whose `safe` was not called yet */
+    _Atomic pid_t stepping, stopping;
+    _Atomic bool parked;
+} safety;
+
+/* All of what follows is called in signal handlers: only what signal-safety(7) allows. */
+
+static void park_stepping(pid_t self)
+{
+    pid_t thread = atomic_load(&safety.stepping);
+    if (!thread || thread == self || tgkill(safety.process, thread, OWN_SIGNAL) < 0)
+        return;
+    int64_t until_ns = fl_now_ns() + PARK_NS;
+    while (!atomic_load(&safety.parked) && fl_now_ns() < until_ns)
+        nanosleep(&(struct timespec){.tv_nsec = PARK_POLL_NS}, NULL);
+}
+
+/* A thread that fails in a block's `safe` comes here again, and goes on with the next block's. */
+static void stop_outputs(void)
+{
+    pid_t nobody = 0, self = gettid();
+    const struct task *task = atomic_load(&safety.task);
+    if (!task || getpid() != safety.process)
+        return;
+    if (!atomic_compare_exchange_strong(&safety.stopping, &nobody, self) && nobody != self)
+        for (;;)
+            pause(); /* the other one ends the process */
+    timer_settime(safety.limit, 0, &(struct itimerspec){.it_value.tv_sec = LIMIT_S}, NULL);
+    park_stepping(self);
+    while (atomic_load(&safety.left)) {
+        const struct member *member = &task->members[atomic_fetch_sub(&safety.left, 1) - 1];
+        if (member->started && member->block->type->safe)
+            member->block->type->safe(member->block);
+    }
+}
+
+static void handle(int number, siginfo_t *info, void *context)
+{
+    (void)context;
+    if (number == OWN_SIGNAL && info->si_code == SI_TIMER)
+        _exit(1);
+    if (number == OWN_SIGNAL && info->si_code == SI_TKILL && gettid() == atomic_load(&safety.stepping)) {
+        atomic_store(&safety.parked, true);
+        for (;;)
+            pause();
+    }
+    stop_outputs();
+    /* The status, and the core if there is one, say what it died of. */
+    signal(number, SIG_DFL);
+    raise(number);
+}
+
+void safety_abandon(const char *text)
+{
+    stop_outputs();
+    if (write(STDERR_FILENO, text, strlen(text)) < 0)
+        _exit(1);
+    _exit(1);
+}
+
+static void at_exit(void)
+{
+    if (atomic_load(&safety.task) && getpid() == safety.process)
+        safety_abandon("flotilla: a block has called exit(); outputs are in their reset state\n");
+}
+
+/* --- not in signal handlers --- */
+
+static void catch_signals(void)
+{
+    struct sigaction action = {.sa_sigaction = handle, .sa_flags = SA_SIGINFO | SA_ONSTACK | SA_NODEFER};
+    safety_orderly_signals(&action.sa_mask);
+    sigaction(OWN_SIGNAL, &action, NULL);
+    for (size_t i = 0; i < FATAL_SIGNALS; i++)
+        sigaction(fatal_signals[i], &action, NULL);
+}
+
+void safety_begin(struct task *task)
+{
+    static bool registered;
+    struct sigevent event = {.sigev_notify = SIGEV_SIGNAL, .sigev_signo = OWN_SIGNAL};
+    if (timer_create(CLOCK_MONOTONIC, &event, &safety.limit) < 0 ||
+        (!registered && (atexit(at_exit) != 0 || at_quick_exit(at_exit) != 0))) {
+        perror("flotilla: what makes outputs safe cannot be prepared");
+        abort();
+    }
+    registered = true;
+    safety.process = getpid();
+    atomic_store(&safety.left, task->count);
+    atomic_store(&safety.task, task);
+    catch_signals();
+}
+
+void safety_end(void)
+{
+    atomic_store(&safety.task, NULL);
+    timer_delete(safety.limit);
+}
+
+void safety_step_begin(void)
+{
+    atomic_store(&safety.stepping, gettid());
+}
+
+void safety_step_end(void)
+{
+    atomic_store(&safety.stepping, 0);
+}
+
+void safety_orderly_signals(sigset_t *signals)
+{
+    static const int others[] = {SIGPIPE, SIGCHLD, SIGCONT, SIGURG, SIGWINCH, SIGKILL, SIGSTOP};
+    sigfillset(signals);
+    sigdelset(signals, OWN_SIGNAL);
+    for (size_t i = 0; i < FATAL_SIGNALS; i++)
+        sigdelset(signals, fatal_signals[i]);
+    for (size_t i = 0; i < sizeof others / sizeof *others; i++)
+        sigdelset(signals, others[i]);
+}
