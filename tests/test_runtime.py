@@ -265,7 +265,7 @@ class Bad:
 BAD = [
     Bad("manner: fail, from: 3", "period: 1 ms", "bad: failed as asked in step 3"),
     Bad("manner: start-fail", "period: 1 ms", "bad: the device is on fire"),
-    Bad("manner: hang, from: 3", "period: 1 ms", "no step for ten periods and a second, after step 3"),
+    Bad("manner: hang, from: 3", "period: 1 ms", "s, after step 3; outputs are in their reset state"),
     Bad("manner: late, from: 3", "period: 10 ms\noverrun: stop-safe", "us after the next was due, 1 in a row"),
     Bad("manner: late, from: 3", "period: 10 ms\noverruns: 4", "us after the next was due, 4 in a row"),
     Bad("manner: late, from: 3", "period: 10 ms\noverrun: catch-up\noverruns: 4", "4 in a row"),
@@ -284,6 +284,43 @@ def test_what_a_block_does_wrong_ends_with_outputs_reset(tasks: Tasks, tmp_path:
     words = device.read_text().split()
     assert words.count("on") == (0 if "start" in bad.manner else words.index("safe"))
     assert words[-1] == ("safe" if "hang" in bad.manner else "terminated")
+
+
+def test_a_hang_ends_within_the_shortest_time_out_of_the_actuators(tasks: Tasks, tmp_path: Path) -> None:
+    """A second thread counts the second that a hang lasted on at least. Seen to fail: `second` before `safe`."""
+    device = tmp_path / "device"
+    ended = tasks.run(
+        task(
+            f"""
+witness: {{type: witness, parameters: {{file: {device}, from: 3}}}}
+slow: {{type: trace, parameters: {{device: {tmp_path / "slow"}, timeout: 60}}}}
+quick: {{type: trace, parameters: {{device: {device}, timeout: 0.1}}}}
+bad: {{type: misbehave, parameters: {{manner: hang, from: 3}}}}
+""",
+            "period: 10 ms\noverruns: 0",
+        )
+    )
+    assert ended.status == 1
+    assert device.read_text().split() == ["on"] * 4 + ["safe"]
+    assert (tmp_path / "slow").read_text().split() == ["on"] * 4 + ["safe"]
+
+
+def test_a_time_out_shorter_than_some_periods_allows_late_steps(tasks: Tasks, tmp_path: Path) -> None:
+    """Seen to fail with the time-out alone as the limit."""
+    device = tmp_path / "device"
+    out = f"out: {{type: trace, parameters: {{device: {device}, timeout: 0.001}}}}\n"
+    late = "bad: {type: misbehave, parameters: {manner: late, from: 1, until: 2, late_s: 1}}"
+    ended = tasks.run(task(out + late, "period: 500 ms"), "--steps", "3")
+    assert ended.status == 0, ended.err
+    assert device.read_text().split() == ["on"] * 3 + ["safe", "terminated"]
+
+
+def test_an_actuators_time_out_is_a_number(tasks: Tasks, tmp_path: Path) -> None:
+    source = (PLUGIN / "misbehave.c").read_text().replace("    double timeout;", "    int64_t timeout;")
+    (tmp_path / "wrong.c").write_text(source)
+    compile_shared(tmp_path / "wrong.c", tmp_path / "wrong.so", f"-I{HEADERS}")
+    lines = Tasks(tasks.program, tmp_path, tmp_path).refusal(task("a: {type: trace, parameters: {device: /dev/x}}"))
+    assert "block trace: an actuator's time-out is no double" in lines[0]
 
 
 def test_overruns_are_left_out_or_caught_up_with(tasks: Tasks) -> None:

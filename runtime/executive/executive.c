@@ -25,6 +25,7 @@ enum {
     STACK_BYTES = 128 * 1024, /* touched before the first step */
     WATCH_MS = 20,
     CATCH_UP_PERIODS = 10, /* further behind, the rest is left out */
+    LATE_PERIODS = 5,      /* from one step's end to the next one's: two for a late trigger, three for a late step */
 };
 
 #define SECOND_NS INT64_C(1000000000)
@@ -219,7 +220,7 @@ static void *control(void *argument)
         if (result->steps == options->steps)
             end(result, ENDING_ASKED, NULL, "all steps are done");
         expected_ns = next_release(executive, expected_ns, release_ns, now_ns, &in_a_row);
-        status_put(executive->status, result);
+        status_put(executive->status, result, now_ns);
         if (result->ending != ENDING_NONE)
             break;
     }
@@ -233,34 +234,49 @@ static void *control(void *argument)
 /* --- guarding thread --- */
 
 /* A step that never ends. */
-static _Noreturn void abandon(const struct executive *executive)
+static _Noreturn void abandon(const struct executive *executive, int64_t silent_ns)
 {
     char text[512];
     snprintf(text, sizeof text,
-             "flotilla: %s: no step for ten periods and a second, after step %" PRIu64
-             "; outputs are in their reset state\n",
-             executive->task->name, status_steps(executive->status));
+             "flotilla: %s: no step ended for %.3f s, after step %" PRIu64 "; outputs are in their reset state\n",
+             executive->task->name, (double)silent_ns / 1e9, status_steps(executive->status));
     safety_abandon(text);
 }
 
-/* Until the control thread has ended, or cannot. */
+/* For how long no step may end: as an actuator holds its outputs without a command. */
+static int64_t patience_of(const struct executive *executive)
+{
+    const struct task *task = executive->task;
+    int64_t patience_ns = executive->options->no_wait ? INT64_MAX : task_actuator_timeout(task);
+    if (patience_ns == INT64_MAX) /* there is none, or time is not measured */
+        return 10 * task->period_ns + SECOND_NS;
+    return patience_ns > LATE_PERIODS * task->period_ns ? patience_ns : LATE_PERIODS * task->period_ns;
+}
+
+/* Until the control thread has ended, or cannot.
+ *
+ * It wakes when patience would end. Where it does so late itself, it was the computer that stood still, and the control
+ * thread gets a part of the time again: it too could not run. */
 static void *guard(void *argument)
 {
     struct executive *executive = argument;
-    uint64_t steps, last = 0;
-    int64_t now_ns, moved_ns = fl_now_ns();
-    const int64_t patience_ns = 10 * executive->task->period_ns + SECOND_NS;
+    const int64_t patience_ns = patience_of(executive), grace_ns = patience_ns / 4;
     struct pollfd ended = {.fd = executive->ended_fd, .events = POLLIN};
-    while (poll(&ended, 1, (int)(patience_ns / 2 / 1000000)) <= 0) {
-        now_ns = fl_now_ns();
-        steps = status_steps(executive->status);
-        if (steps != last)
-            moved_ns = now_ns;
-        last = steps;
-        if (now_ns - moved_ns > patience_ns)
-            abandon(executive);
+    int64_t last_ns = 0, until_ns = 0;
+    for (;;) {
+        int64_t ended_ns = status_ended_ns(executive->status), now_ns = fl_now_ns();
+        if (ended_ns != last_ns)
+            until_ns = ended_ns + patience_ns;
+        else if (now_ns - until_ns > grace_ns)
+            until_ns = now_ns + grace_ns;
+        else if (now_ns >= until_ns)
+            abandon(executive, now_ns - ended_ns);
+        last_ns = ended_ns;
+        int64_t left_ns = until_ns > now_ns ? until_ns - now_ns : 0;
+        const struct timespec left = {(time_t)(left_ns / SECOND_NS), (long)(left_ns % SECOND_NS)};
+        if (ppoll(&ended, 1, &left, NULL) > 0)
+            return NULL;
     }
-    return NULL;
 }
 
 /* --- serving thread --- */

@@ -320,6 +320,16 @@ void fl_inner_end(const struct fl_block *outer)
         fl_inner_terminate(inner);
 }
 
+int64_t inner_shortest(const struct fl_block *outer, int64_t (*of)(const struct fl_block *block))
+{
+    int64_t shortest = INT64_MAX;
+    for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next) {
+        int64_t value = inner->block ? of(inner->block) : INT64_MAX;
+        shortest = value < shortest ? value : shortest;
+    }
+    return shortest;
+}
+
 void inner_destroy(const struct fl_block *outer)
 {
     for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next) {

@@ -35,6 +35,8 @@ static const char *fault(const struct registry *registry, const struct fl_block_
         const struct fl_parameter *parameter = &type->parameters[i];
         if ((parameter->kind == FL_KIND_CHOICE) != (parameter->choices != NULL))
             return "a parameter has choices but is no int, or is one without";
+        if (parameter->flags & FL_ACTUATOR_TIMEOUT && parameter->kind != FL_KIND_REAL)
+            return "an actuator's time-out is no double";
         if (parameter->offset >= type->parameters_size)
             return "a parameter lies outside its structure";
     }

@@ -7,6 +7,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+enum { FIRST_PERIODS = 3 }; /* to a task's first step, at most */
+
 struct sensor {
     const char *name;
     const bool *flag; /* the block's outputs */
@@ -19,6 +21,7 @@ struct sensor {
  * reads any of it also sees that turn. */
 struct status {
     _Alignas(64) _Atomic uint32_t turn;
+    _Atomic int64_t ended_ns;
     _Atomic uint64_t steps, overruns, skipped, timeouts, overrun_step;
     _Atomic int64_t overrun_ns, late_ns;
     const struct task *task;
@@ -65,6 +68,7 @@ struct status *status_create(const struct task *task)
     memset(status, 0, bytes);
     status->task = task;
     status->begun_ns = fl_now_ns();
+    atomic_init(&status->ended_ns, status->begun_ns + FIRST_PERIODS * task->period_ns);
     for (size_t i = 0; i < task->count; i++) {
         const struct fl_block *block = task->members[i].block;
         int port = sensor_port(block);
@@ -80,10 +84,11 @@ void status_destroy(struct status *status)
     free(status);
 }
 
-void status_put(struct status *status, const struct run_result *result)
+void status_put(struct status *status, const struct run_result *result, int64_t now_ns)
 {
     uint32_t turn = atomic_load_explicit(&status->turn, memory_order_relaxed);
     atomic_store_explicit(&status->turn, turn + 1, memory_order_relaxed);
+    PUT(status->ended_ns, now_ns);
     PUT(status->steps, result->steps);
     PUT(status->timeouts, result->timeouts);
     if (result->overruns != atomic_load_explicit(&status->overruns, memory_order_relaxed)) {
@@ -103,6 +108,11 @@ void status_put(struct status *status, const struct run_result *result)
 uint64_t status_steps(const struct status *status)
 {
     return GET(status->steps);
+}
+
+int64_t status_ended_ns(const struct status *status)
+{
+    return GET(status->ended_ns);
 }
 
 /* To be freed. Again whenever the control thread wrote meanwhile: it does for well under a microsecond of each period.

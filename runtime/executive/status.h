@@ -22,11 +22,13 @@ struct status;
 struct status *status_create(const struct task *task);
 void status_destroy(struct status *status); /* NULL is allowed */
 
-/* After each step, by the control thread, in real time: the counts of `result`, and the sensors' outputs. */
-void status_put(struct status *status, const struct run_result *result);
+/* After each step, which ended at `now_ns`, by the control thread, in real time: the counts of `result`, and the
+ * sensors' outputs. */
+void status_put(struct status *status, const struct run_result *result, int64_t now_ns);
 
-/* Steps done. */
+/* Steps done, and when the last one ended, CLOCK_MONOTONIC; before the first: when it is to be expected. */
 uint64_t status_steps(const struct status *status);
+int64_t status_ended_ns(const struct status *status);
 
 /* As a line of JSON, or as lines for people. Not for the control thread. */
 void status_write(const struct status *status, bool json, FILE *out);

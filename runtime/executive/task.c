@@ -2,8 +2,10 @@
 #include "task.h"
 
 #include "block.h"
+#include "inner.h"
 
 #include <limits.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -439,6 +441,30 @@ void task_free(struct task *task)
     free(task->members);
     free(task->name);
     *task = (struct task){0};
+}
+
+static int64_t actuator_timeout(const struct fl_block *block)
+{
+    int64_t shortest_ns = inner_shortest(block, actuator_timeout);
+    for (uint32_t i = 0; i < block->type->parameter_count; i++) {
+        const struct fl_parameter *parameter = &block->type->parameters[i];
+        if (!(parameter->flags & FL_ACTUATOR_TIMEOUT))
+            continue;
+        double seconds = *(const double *)value_of(block, parameter);
+        int64_t timeout_ns = seconds < 1e9 ? llround(seconds * 1e9) : INT64_MAX;
+        shortest_ns = timeout_ns < shortest_ns ? timeout_ns : shortest_ns;
+    }
+    return shortest_ns;
+}
+
+int64_t task_actuator_timeout(const struct task *task)
+{
+    int64_t shortest_ns = INT64_MAX;
+    for (size_t i = 0; i < task->count; i++) {
+        int64_t timeout_ns = actuator_timeout(task->members[i].block);
+        shortest_ns = timeout_ns < shortest_ns ? timeout_ns : shortest_ns;
+    }
+    return shortest_ns;
 }
 
 static void write_edge(const struct task *task, const struct fl_block *to, uint32_t input, FILE *out)

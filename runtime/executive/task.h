@@ -37,6 +37,10 @@ void task_free(struct task *task);
 const void *task_signal(const struct task *task, const char *name, enum fl_type *type, uint32_t *width, char *reason,
                         size_t reason_size);
 
+/* The shortest time-out of an actuator (FL_ACTUATOR_TIMEOUT), of inner blocks too once they have started, in
+ * nanoseconds; INT64_MAX: there is none. */
+int64_t task_actuator_timeout(const struct task *task);
+
 /* The task as a graph for Graphviz. */
 void task_write_dot(const struct task *task, FILE *out);
 

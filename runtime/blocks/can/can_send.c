@@ -27,8 +27,8 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct can_send, reset, .fallback = "",
                  .summary = "data of the frame sent instead when the data are too old, and at the end, as hexadecimal "
                             "digits; empty: none is sent"),
-    FL_PARAMETER(struct can_send, timeout, .fallback = "0.5", .min = 1e-6, .max = 1e6, .unit = "s",
-                 .summary = "age from which the data are too old"),
+    FL_PARAMETER(struct can_send, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "0.5", .min = 1e-6, .max = 1e6,
+                 .unit = "s", .summary = "age from which the data are too old"),
 };
 
 enum { DATA, AGE };

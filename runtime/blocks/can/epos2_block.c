@@ -44,8 +44,8 @@ static const struct fl_parameter parameters[] = {
                  .summary = "of a quick stop; 0 leaves what the drive has stored"),
     FL_PARAMETER(struct epos2_block, max_current, .fallback = "0", .min = 0, .max = 32.767, .unit = "A",
                  .summary = "limit of the output current; 0 leaves what the drive has stored"),
-    FL_PARAMETER(struct epos2_block, timeout, .fallback = "0.1", .min = 1e-6, .max = 1e6, .unit = "s",
-                 .summary = "age from which a command, or a measurement, is too old"),
+    FL_PARAMETER(struct epos2_block, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "0.1", .min = 1e-6, .max = 1e6,
+                 .unit = "s", .summary = "age from which a command, or a measurement, is too old"),
     FL_PARAMETER(struct epos2_block, fault_reset, .fallback = "enable", .choices = "enable|automatic",
                  .summary = "what resets a fault: `enable` going from 0 to 1, or also the block, once a second"),
 };

@@ -43,8 +43,8 @@ static const struct fl_parameter parameters[] = {
                  .summary = "relays after the last command and without any, likewise"),
     FL_PARAMETER(struct ir104, fresh, .fallback = "flag", .choices = "flag|sequence",
                  .summary = "what tells that the command is a new one: a flag of 1, or a sequence that moved on"),
-    FL_PARAMETER(struct ir104, timeout, .fallback = "0.1", .min = 0.001, .max = 60, .unit = "s",
-                 .summary = "time without a new command after which the relays go to `reset`"),
+    FL_PARAMETER(struct ir104, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "0.1", .min = 0.001, .max = 60,
+                 .unit = "s", .summary = "time without a new command after which the relays go to `reset`"),
 };
 
 static const struct fl_port outputs[] = {

@@ -97,6 +97,9 @@ enum {
     FL_TUNABLE = 1u << 0,
     /* the choice names a device, such as a board by its address: of this type of block one only may have it */
     FL_EXCLUSIVE = 1u << 1,
+    /* a time in seconds (double) after which the actuator's outputs go to their reset state without a new command; once
+     * no step of the task has ended for so long, but at least for five periods, it is ended with outputs made safe */
+    FL_ACTUATOR_TIMEOUT = 1u << 2,
 };
 
 struct fl_parameter {

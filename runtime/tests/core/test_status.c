@@ -69,7 +69,7 @@ static void what_was_put_is_written(void **state)
     struct status *status = status_create(&task);
     struct run_result result = {.steps = 1, .timeouts = 4};
     set_sensor(false, 0.25);
-    status_put(status, &result);
+    status_put(status, &result, fl_now_ns());
     written(status, true, line);
     assert_non_null(strstr(line, "{\"task\": \"heading\", \"period_s\": 0.01, \"running_s\": 0."));
     assert_non_null(
@@ -78,7 +78,7 @@ static void what_was_put_is_written(void **state)
 
     result = (struct run_result){.steps = 9, .overruns = 2, .skipped = 3, .last_overrun = {7, fl_now_ns(), 1500000}};
     set_sensor(true, 0.004);
-    status_put(status, &result);
+    status_put(status, &result, fl_now_ns());
     assert_int_equal(status_steps(status), 9);
     written(status, true, line);
     assert_non_null(strstr(line, "\"overruns\": 2, \"skipped\": 3"));
@@ -102,7 +102,7 @@ static void *control(void *argument)
     for (uint64_t n = 1; !atomic_load(&done); n++) {
         struct run_result result = {.steps = n, .overruns = n, .skipped = n, .timeouts = n, .last_overrun = {n, 0, 0}};
         set_sensor(n % 2, (double)(n % 1000));
-        status_put(status, &result);
+        status_put(status, &result, fl_now_ns());
     }
     return NULL;
 }
@@ -120,7 +120,7 @@ static void a_reading_is_of_one_step(void **state)
     struct status *status = status_create(&task);
     struct run_result first = {.steps = 1, .overruns = 1, .skipped = 1, .timeouts = 1, .last_overrun = {1, 0, 0}};
     set_sensor(true, 1);
-    status_put(status, &first);
+    status_put(status, &first, fl_now_ns());
     assert_int_equal(pthread_create(&thread, NULL, control, status), 0);
     for (unsigned other = 0; other < READINGS; sched_yield()) {
         assert_true(fl_now_ns() < end_ns);

@@ -152,9 +152,13 @@ FL_BLOCK(misbehave) = {
 /* An actuator whose device is a file: "on" by steps, "reset" by safe and terminate. */
 struct trace {
     struct fl_device device;
+    double timeout;
 };
 
-static const struct fl_parameter trace_parameters[] = {FL_PARAMETER(struct trace, device)};
+static const struct fl_parameter trace_parameters[] = {
+    FL_PARAMETER(struct trace, device),
+    FL_PARAMETER(struct trace, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "1"),
+};
 
 static void trace_write(struct fl_block *block, const char *word)
 {
@@ -188,4 +192,56 @@ FL_BLOCK(trace) = {
     .step = trace_step,
     .safe = trace_safe,
     .terminate = trace_terminate,
+};
+
+/* Counts a second from its step `from` on, and writes into a trace's file then. */
+struct witness {
+    const char *file;
+    int64_t from;
+};
+
+static const struct fl_parameter witness_parameters[] = {
+    FL_PARAMETER(struct witness, file),
+    FL_PARAMETER(struct witness, from),
+};
+
+static void witness_thread(struct fl_driver *driver, void *context)
+{
+    struct fl_block *block = context;
+    const struct witness *parameters = block->parameters;
+    struct misbehaving *state = block->state;
+    int naps = 0; /* a computer that stands still makes one longer */
+    while (fl_driver_wait(driver, -1, false, 25) == 0) {
+        if (!state->now || ++naps != 40)
+            continue;
+        int fd = open(parameters->file, O_WRONLY | O_APPEND);
+        if (fd >= 0 && write(fd, "second\n", 7) > 0)
+            close(fd);
+    }
+}
+
+static int witness_start(struct fl_block *block)
+{
+    struct misbehaving *state = block->state;
+    state->driver = fl_driver_start(block, witness_thread, block);
+    return state->driver ? FL_OK : FL_FAILED;
+}
+
+static int witness_step(struct fl_block *block)
+{
+    const struct witness *parameters = block->parameters;
+    struct misbehaving *state = block->state;
+    state->now = (int64_t)block->step >= parameters->from;
+    return FL_OK;
+}
+
+FL_BLOCK(witness) = {
+    .abi = MISBEHAVE_ABI,
+    .name = "witness",
+    FL_TABLE(parameter, witness_parameters),
+    .parameters_size = sizeof(struct witness),
+    .state_size = sizeof(struct misbehaving),
+    .start = witness_start,
+    .step = witness_step,
+    .terminate = misbehave_terminate,
 };
