@@ -166,6 +166,10 @@ REFUSED = {
         task("a: {type: gain, in: {in: b.out}}\nb: {type: gain, in: {in: a.out}}"),
         "3: cycle without delay: a → b → a; put a block delay into one of its wires",
     ),
+    "a frame twice": (
+        task("a: {type: can-send, in: {data: 1}, parameters: {id: 9, length: 1}}\n" * 2).replace("a:", "b:", 1),
+        '4: block a: interface "can0", id 9, extended false is block b\'s; a device serves one block',
+    ),
     "a device twice": (
         task("a: {type: trace, parameters: {device: /dev/x}}\nb: {type: trace, parameters: {device: /dev/x}}"),
         '4: block b: device "/dev/x" is block a\'s; a device serves one block',
@@ -480,6 +484,31 @@ def test_outputs_are_reset_after_a_task_was_killed(
     assert device.read_text().split()[-1] == "on"
     assert tasks.run(text, "--safe").status == 0
     assert device.read_text().split()[-2:] == ["safe", "terminated"]
+
+
+def test_one_task_moves_an_actuator(
+    tasks: Tasks, running: Callable[[str], subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    """Neither another task nor `--safe` touches it meanwhile; a task that was killed holds nothing. Seen to fail: both
+    did."""
+    device = tmp_path / "device"
+    text = task(TRACE.format(file=device) + "a: {type: gain, in: {in: 1}}", PATIENT)
+    first = running(text)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "link").symlink_to(device)
+    other = Tasks(tasks.program, tasks.plugins, tmp_path / "other")
+    held = f"held by process {first.pid} ({tasks.program} --blocks"
+    for path in (device, tmp_path / "other" / "link"):
+        for options in ([], ["--safe"]):
+            ended = other.run(task(TRACE.format(file=path)), *options)
+            assert ended.status == 1
+            assert f'device "{path}" is {held}' in ended.err
+    assert set(device.read_text().split()) == {"on"}
+    first.kill()
+    first.wait()
+    assert other.run(task(TRACE.format(file=device)), "--safe").status == 0
+    assert other.run(task(TRACE.format(file=device)), "--steps", "1").status == 0
+    assert device.read_text().split()[-5:] == ["safe", "terminated", "on", "safe", "terminated"]
 
 
 def test_outputs_are_reset_where_nobody_hears_of_a_failure(tasks: Tasks, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 #define _GNU_SOURCE
 #include "block.h"
 
+#include "device.h"
 #include "inner.h"
 
 #include <errno.h>
@@ -179,6 +180,7 @@ void block_destroy(struct fl_block *block)
     if (!block)
         return;
     inner_destroy(block);
+    device_release(block->service);
     for (struct fl_memory *memory = block->service->memory, *next; memory; memory = next) {
         next = memory->next;
         free(memory);

@@ -2,6 +2,7 @@
 #include "executive.h"
 
 #include "block.h"
+#include "device.h"
 #include "privilege.h"
 #include "safety.h"
 #include "schedule.h"
@@ -25,6 +26,7 @@ enum {
     STACK_BYTES = 128 * 1024, /* touched before the first step */
     WATCH_MS = 20,
     CATCH_UP_PERIODS = 10, /* further behind, the rest is left out */
+    HOLDER_MS = 1000,      /* to make outputs safe that another process has, until it ends */
     LATE_PERIODS = 5,      /* from one step's end to the next one's: two for a late trigger, three for a late step */
 };
 
@@ -59,6 +61,10 @@ static bool start_blocks(struct task *task, struct run_result *result)
 {
     for (size_t i = 0; i < task->count; i++) {
         struct member *member = &task->members[i];
+        if (device_claim(member->block) != FL_OK) {
+            end(result, ENDING_FAILED, member->block, member->block->service->failure);
+            return false;
+        }
         member->started = true; /* terminate also cleans up after a start that failed halfway */
         if (member->block->type->start && member->block->type->start(member->block) != FL_OK) {
             end(result, ENDING_FAILED, member->block, member->block->service->failure);
@@ -99,6 +105,10 @@ unsigned executive_make_safe(struct task *task)
         struct member *member = &task->members[i];
         const struct fl_block_type *type = member->block->type;
         if (!type->safe)
+            continue;
+        member->block->service->patience_ms = HOLDER_MS;
+        member->failed = device_claim(member->block) != FL_OK;
+        if (member->failed)
             continue;
         member->started = true;
         member->failed = type->start && type->start(member->block) != FL_OK;

@@ -54,7 +54,8 @@ struct run_result {
 /* Run until it ends; the blocks are terminated and the result is complete then. Messages go to stderr. */
 void executive_run(struct task *task, const struct run_options *options, struct run_result *result);
 
-/* Bring all outputs to their reset state without a step: for after a task that was killed. Number of failures. */
+/* Bring all outputs to their reset state without a step: for after a task that was killed. What another process still
+ * holds after a second is left alone. Number of failures. */
 unsigned executive_make_safe(struct task *task);
 
 /* Steps, overruns and times of task and blocks as JSON. */

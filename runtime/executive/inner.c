@@ -2,6 +2,7 @@
 #include "inner.h"
 
 #include "block.h"
+#include "device.h"
 #include "parameter.h"
 #include "registry.h"
 
@@ -79,6 +80,7 @@ struct fl_inner *fl_inner_new(const char *type, double period_s)
     inner->block = block_create(found, beginning->name);
     inner->block->period_ns = period_ns ? period_ns : beginning->period_ns;
     inner->block->service->priority = service->priority;
+    inner->block->service->patience_ms = service->patience_ms;
     inner->next = service->inner;
     service->inner = inner;
     return inner;
@@ -221,6 +223,10 @@ void fl_inner_start(struct fl_inner *inner, const char *ports)
                  "its ports are %s, and the code was made for %s; make it anew by flotilla-blocks --legacy-code", found,
                  ports);
         fail(inner, type->name, reason);
+        return;
+    }
+    if (device_claim(block) != FL_OK) {
+        fail(inner, type->name, block->service->failure);
         return;
     }
     inner->started = true; /* terminate also cleans up after a start that failed halfway */

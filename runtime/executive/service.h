@@ -14,7 +14,9 @@ struct fl_memory {
 struct fl_service {
     struct fl_memory *memory;
     char failure[FL_FAILURE_BYTES];
-    int priority; /* SCHED_FIFO of the block's threads; 0: ordinary */
+    int priority;    /* SCHED_FIFO of the block's threads; 0: ordinary */
+    int patience_ms; /* how long to wait for a device that another process holds */
+    int claim_fd;    /* holds the block's device (device.h); below 1: none */
     struct fl_port *in_ports, *out_ports;
     size_t near_used;          /* of the bytes beside the block */
     struct registry *registry; /* where inner blocks are looked for; NULL: it can have none */

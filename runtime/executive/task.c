@@ -2,6 +2,7 @@
 #include "task.h"
 
 #include "block.h"
+#include "device.h"
 #include "inner.h"
 
 #include <limits.h>
@@ -54,6 +55,7 @@ static void make_block(struct building *building, struct registry *registry, con
     parameters_set(block, entry->parameters, entry->parameter_count, entry->line, building->problems);
     if (building->problems->count == before && type->configure && type->configure(block) != FL_OK)
         problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
+    member->wrong = building->problems->count != before;
     member->incomplete = type->configure && building->problems->count != before;
     if (block_make_signals(block) != FL_OK)
         problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
@@ -64,40 +66,56 @@ static const void *value_of(const struct fl_block *block, const struct fl_parame
     return (const char *)block->parameters + parameter->offset;
 }
 
-static bool same_device(const struct fl_block *a, const struct fl_parameter *of_a, const struct fl_block *b,
-                        const struct fl_parameter *of_b)
+static const struct fl_device *device_of(const struct fl_block *block)
 {
-    if (of_a->kind == FL_KIND_DEVICE && of_b->kind == FL_KIND_DEVICE) {
-        const struct fl_device *one = value_of(a, of_a), *other = value_of(b, of_b);
+    for (uint32_t i = 0; i < block->type->parameter_count; i++)
+        if (block->type->parameters[i].kind == FL_KIND_DEVICE)
+            return value_of(block, &block->type->parameters[i]);
+    return NULL;
+}
+
+/* What device_write() writes, to be freed; NULL: the block has no device. */
+static char *written_device(const struct fl_block *block)
+{
+    char *text = NULL;
+    size_t size = 0;
+    FILE *out = open_memstream(&text, &size);
+    if (!out)
+        abort();
+    bool any = device_write(block, out);
+    if (fclose(out) == 0 && any)
+        return text;
+    free(text);
+    return NULL;
+}
+
+static bool same_device(const struct fl_block *a, const char *of_a, const struct fl_block *b, const char *of_b)
+{
+    const struct fl_device *one = device_of(a), *other = device_of(b);
+    if (one && other) /* of whatever types */
         return one->path && other->path && strcmp(one->path, other->path) == 0;
-    }
-    return of_a == of_b && of_a->flags & FL_EXCLUSIVE &&
-           *(const int *)value_of(a, of_a) == *(const int *)value_of(b, of_b);
+    return a->type == b->type && of_a && of_b && strcmp(of_a, of_b) == 0;
 }
 
 /* Two blocks on one device would take each other's bytes, or undo each other's commands. */
 static void check_devices(struct building *building)
 {
     const struct task *task = building->task;
+    char **devices = grown(NULL, sizeof *devices * (task->count + 1));
     for (size_t i = 0; i < task->count; i++) {
+        const struct fl_block *later = task->members[i].block;
+        devices[i] = task->members[i].wrong ? NULL : written_device(later);
         for (size_t j = 0; j < i; j++) {
-            const struct fl_block *later = task->members[i].block, *earlier = task->members[j].block;
-            for (uint32_t p = 0; p < later->type->parameter_count; p++) {
-                for (uint32_t q = 0; q < earlier->type->parameter_count; q++) {
-                    const struct fl_parameter *parameter = &later->type->parameters[p];
-                    if (!same_device(later, parameter, earlier, &earlier->type->parameters[q]))
-                        continue;
-                    char text[PATH_MAX] = "";
-                    FILE *out = fmemopen(text, sizeof text, "w");
-                    parameter_write(parameter, later->parameters, out);
-                    fclose(out);
-                    problem(building->problems, building->file->blocks[i].line,
-                            "block %s: %s %s is block %s's; a device serves one block", later->name, parameter->name,
-                            text, earlier->name);
-                }
-            }
+            const struct fl_block *earlier = task->members[j].block;
+            if (same_device(later, devices[i], earlier, devices[j]))
+                problem(building->problems, building->file->blocks[i].line,
+                        "block %s: %s is block %s's; a device serves one block", later->name, devices[i],
+                        earlier->name);
         }
     }
+    for (size_t i = 0; i < task->count; i++)
+        free(devices[i]);
+    free(devices);
 }
 
 /* --- wires --- */

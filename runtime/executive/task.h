@@ -15,6 +15,7 @@ struct member {
     int64_t every, offset;
     struct took took;     /* by its steps, after a run */
     bool started, failed; /* `failed`: its start */
+    bool wrong;           /* its parameters */
     bool incomplete;      /* its ports are not known, because its parameters are wrong */
 };
 

@@ -19,11 +19,14 @@ struct sent {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct can_send, interface, .fallback = "can0", .summary = "network interface of the bus"),
-    FL_PARAMETER(struct can_send, id, .min = 0, .max = CAN_EFF_MASK, .summary = "identifier of the frames"),
+    FL_PARAMETER(struct can_send, interface, .flags = FL_EXCLUSIVE, .fallback = "can0",
+                 .summary = "network interface of the bus"),
+    FL_PARAMETER(struct can_send, id, .flags = FL_EXCLUSIVE, .min = 0, .max = CAN_EFF_MASK,
+                 .summary = "identifier of the frames"),
     FL_PARAMETER(struct can_send, length, .fallback = "8", .min = 0, .max = CAN_MAX_DLEN, .unit = "B",
                  .summary = "bytes of a frame"),
-    FL_PARAMETER(struct can_send, extended, .fallback = "false", .summary = "an identifier of 29 bits instead of 11"),
+    FL_PARAMETER(struct can_send, extended, .flags = FL_EXCLUSIVE, .fallback = "false",
+                 .summary = "an identifier of 29 bits instead of 11"),
     FL_PARAMETER(struct can_send, reset, .fallback = "",
                  .summary = "data of the frame sent instead when the data are too old, and at the end, as hexadecimal "
                             "digits; empty: none is sent"),

@@ -24,8 +24,10 @@ struct state {
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct epos2_block, interface, .fallback = "can0", .summary = "network interface of the bus"),
-    FL_PARAMETER(struct epos2_block, node, .min = 1, .max = 127, .summary = "the drive's node address"),
+    FL_PARAMETER(struct epos2_block, interface, .flags = FL_EXCLUSIVE, .fallback = "can0",
+                 .summary = "network interface of the bus"),
+    FL_PARAMETER(struct epos2_block, node, .flags = FL_EXCLUSIVE, .min = 1, .max = 127,
+                 .summary = "the drive's node address"),
     FL_PARAMETER(struct epos2_block, master, .fallback = "127", .min = 1, .max = 127,
                  .summary = "node address under which this block sends heartbeats: another for each drive"),
     FL_PARAMETER(struct epos2_block, mode, .choices = "position|velocity|current|profile-position|profile-velocity",

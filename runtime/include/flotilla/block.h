@@ -76,7 +76,10 @@ struct fl_texts {
     size_t count;
     const char *const *value;
 };
-struct fl_device { /* a device that one block has to itself: two blocks on one are an error */
+/* A device that one block has to itself: two blocks of a task on one are an error, and two tasks if the type has
+ * `safe`.
+ */
+struct fl_device {
     const char *path;
 };
 
@@ -95,7 +98,8 @@ enum {
     /* may be set while the task runs, between two steps: `step` reads it where it uses it. Not for texts and lists, and
      * not for what start, initialize or a driver's thread reads. */
     FL_TUNABLE = 1u << 0,
-    /* the choice names a device, such as a board by its address: of this type of block one only may have it */
+    /* names a device, such as a board by its address, alone or together with the others that have this flag: one block
+     * of this type may have it, in one task of the computer if the type has `safe` */
     FL_EXCLUSIVE = 1u << 1,
     /* a time in seconds (double) after which the actuator's outputs go to their reset state without a new command; once
      * no step of the task has ended for so long, but at least for five periods, it is ended with outputs made safe */
