@@ -165,7 +165,7 @@ live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.
 top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
 	$(Q)$(station) --top $(if $(filter-out 0,$(ASK)),--ask) $(if $(OUT),--record $(OUT)) $(if $(PORT),--live $(PORT))
 
-param: | setup ## parameters of a task that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
+param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
 	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(PARAM) $(if $(PARAM),$(if $(VALUE),-- '$(VALUE)'))
 
 ##@ Real time

@@ -577,6 +577,22 @@ def test_privileges_that_are_missing_are_named(tasks: Tasks) -> None:
     assert "memory cannot be locked" in done.stderr
 
 
+def test_a_leak_of_an_app_is_its_own(flotilla_run: Path) -> None:
+    """Sessions of sshd have an adjustment of 0. Seen to fail: apps had -900, all memory and all of it locked."""
+
+    def unit(name: str) -> dict[str, str]:
+        lines = flotilla_run.with_name(f"flotilla-{name}@.service").read_text().splitlines()
+        return dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
+
+    app, control = unit("app"), unit("task")
+    assert int(app["OOMScoreAdjust"]) > 0 > int(control["OOMScoreAdjust"])
+    assert app["LimitMEMLOCK"] != "infinity"
+    assert int(app["TasksMax"]) <= int(control["TasksMax"])
+    shares = [int(each["MemoryMax"].removesuffix("%")) for each in (app, control)]
+    assert shares[0] < shares[1] < 75, "what kills one process leaves the robot enough"
+    assert app["MemorySwapMax"] == control["MemorySwapMax"] == "0"
+
+
 def test_blocks_are_listed_with_ports_units_and_source(flotilla_run: Path) -> None:
     program = str(flotilla_run.with_name("flotilla-blocks"))
     listed = subprocess.run([program], capture_output=True, text=True, check=True).stdout

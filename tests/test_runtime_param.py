@@ -9,6 +9,7 @@ import signal
 import socket
 import stat
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -169,6 +170,49 @@ def test_a_value_is_refused_in_the_words_of_the_task_file(start: Start, name: st
 def test_what_cannot_be_is_said(start: Start, words: tuple[str, ...], said: str) -> None:
     refused = start().param(*words)
     assert (refused.returncode, refused.stdout, refused.stderr) == (1, "", f"flotilla-param: task task: {said}\n")
+
+
+# As root of namespaces of its own, with a /run of its own: what services of a name have there, and what is said of it.
+SERVICES = """
+import os, pathlib, subprocess, sys
+program, task, *directories = sys.argv[1:]
+subprocess.run(["mount", "-t", "tmpfs", "tmpfs", "/run"], check=True)
+for number, directory in enumerate(directories):
+    os.makedirs(directory)
+    copy = pathlib.Path(f"/run/{number}.yml")
+    copy.write_bytes(pathlib.Path(task).read_bytes())
+    process = subprocess.Popen(
+        [program, "--watch", "a.out", copy], env=os.environ | {"RUNTIME_DIRECTORY": directory}, stdout=subprocess.PIPE
+    )
+    assert process.stdout.readline()
+os.execl(program.replace("flotilla-run", "flotilla-param"), "flotilla-param", "hover", "pid.max")
+"""
+
+
+@pytest.mark.parametrize(
+    ("directories", "status", "said"),
+    [
+        (["/run/flotilla/hover"], 0, "1\n"),
+        (["/run/flotilla-apps/hover"], 0, "1\n"),
+        (
+            ["/run/flotilla/hover", "/run/flotilla-apps/hover"],
+            1,
+            "flotilla-param: a control task and an app are named hover: say which by --control "
+            "/run/flotilla/hover/control or /run/flotilla-apps/hover/control\n",
+        ),
+        ([], 1, "flotilla-param: no task hover runs here: nobody listens at /run/flotilla/hover/control\n"),
+    ],
+)
+def test_an_app_is_found_by_its_name_too(
+    flotilla_run: Path, tmp_path: Path, directories: list[str], status: int, said: str
+) -> None:
+    """Seen to fail for an app: no task hover runs here."""
+    (tmp_path / "task.yml").write_text(TASK.format(**USUAL))
+    argv = ["unshare", "--user", "--map-root-user", "--mount", "--pid", "--fork", "--kill-child"]
+    argv += [sys.executable, "-c", SERVICES, str(flotilla_run), str(tmp_path / "task.yml"), *directories]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=SECONDS, check=False)
+    shown = done.stdout if status == 0 else done.stderr.splitlines(keepends=True)[-1]
+    assert (done.returncode, shown) == (status, said)
 
 
 def test_no_such_task(flotilla_run: Path, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Control tasks of a robot from the station: parameters, by its own `flotilla-param` (`make param`); start and stop."""
+"""Control tasks and apps of a robot from the station: parameters, by its own `flotilla-param` (`make param`); start and
+stop of control tasks."""
 
 from __future__ import annotations
 

@@ -15,10 +15,11 @@
 
 static const char usage[] =
     "usage: flotilla-param [OPTION]... TASK [BLOCK.PARAMETER [VALUE]]\n"
-    "List the parameters of a task that runs here, print one of them, or set it between two steps.\n"
+    "List the parameters of a task that runs here, or of an app's, print one of them, or set it between two steps.\n"
     "\n"
     "  --status[=json] how the task does instead: steps, overruns, flags and ages of its sensors\n"
-    "  --control PATH  the task's socket (default: /run/flotilla/TASK/control)\n"
+    "  --control PATH  the task's socket (default: control in /run/flotilla/TASK or\n"
+    "                  /run/flotilla-apps/TASK, whichever is there)\n"
     "  --help, --version\n"
     "\n"
     "Status: 0 done, 1 refused, or no such task runs, 2 the command line is wrong.\n";
@@ -108,6 +109,26 @@ static bool write_request(char **request, size_t *length, const char *verb, char
     return fclose(out) == 0 && good;
 }
 
+/* Where services have their sockets: control tasks, and apps. */
+static const char *const directories[] = {"/run/flotilla", "/run/flotilla-apps"};
+
+/* The socket of the service of that name: of a task, unless only an app has one. False when both have. */
+static bool find_socket(const char *name, char *path, size_t size)
+{
+    char other[PATH_MAX];
+    snprintf(path, size, "%s/%s/control", directories[0], name);
+    snprintf(other, sizeof other, "%s/%s/control", directories[1], name);
+    if (access(other, F_OK) < 0)
+        return true;
+    if (access(path, F_OK) == 0) {
+        fprintf(stderr, "flotilla-param: a control task and an app are named %s: say which by --control %s or %s\n",
+                name, path, other);
+        return false;
+    }
+    snprintf(path, size, "%s", other);
+    return true;
+}
+
 int main(int argc, char **argv)
 {
     static const char *const verbs[] = {"list", "get", "set"}; /* by the number of words */
@@ -142,7 +163,8 @@ int main(int argc, char **argv)
         fputs(usage, stderr);
         return 2;
     }
-    snprintf(usual, sizeof usual, "/run/flotilla/%s/control", argv[optind]);
+    if (!path && !find_socket(argv[optind], usual, sizeof usual))
+        return 1;
     int done = ask(argv[optind], path ? path : usual, request, length);
     free(request);
     return done;
