@@ -181,6 +181,46 @@ def test_a_step_that_spins_without_end_is_ended_until_it_is_given_up(bench: Benc
     bench.do("spinning", "remove")
 
 
+LEAKING = r"""
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+
+int main(void)
+{
+    if (mlockall(MCL_CURRENT | MCL_FUTURE))
+        perror("mlockall");
+    for (;;) {
+        char *memory = malloc(1 << 20);
+        if (memory)
+            memset(memory, 1, 1 << 20);
+    }
+}
+"""
+
+
+def test_an_app_that_leaks_is_killed_and_nothing_else(bench: Bench) -> None:
+    """Five times, and is given up. The connection is the same all the time: its sshd is an ordinary process."""
+    session = bench.guest.shell.run(["sh", "-c", "echo $PPID"]).stdout
+    directory = bench.new("make", "leaking")
+    (directory / "main.c").write_text(LEAKING)
+    (directory / "app.yml").write_text("kind: make\nprogram: leaking\n")
+    bench.place(directory)
+    bench.guest.shell.run(["sudo", "systemctl", "start", "--no-block", "flotilla-app@leaking"])
+    end = time.monotonic() + 300
+    while (status := bench.status("leaking"))["ActiveState"] != "failed" and time.monotonic() < end:
+        pass  # asking takes a second
+    assert status["ActiveState"] == "failed", status
+    log = bench.guest.shell.run(["sudo", "journalctl", "-o", "cat", "-u", "flotilla-app@leaking"]).stdout
+    assert log.count("Main process exited, code=killed, status=9/KILL") == 5, log
+    kernel = bench.guest.shell.run(["sudo", "journalctl", "-k", "-b", "-o", "cat"]).stdout
+    killed = re.findall(r"out of memory: Killed process \d+ \((\w+)\)", kernel, re.IGNORECASE)
+    assert (set(killed), len(killed)) == ({"leaking"}, 5), killed
+    assert bench.guest.shell.run(["sh", "-c", "echo $PPID"]).stdout == session
+    bench.do("leaking", "remove")
+
+
 def test_a_kept_app_starts_with_the_robot(bench: Bench) -> None:
     """Power fails as soon as the command is done. An app that is not kept shows that the restart was one."""
     with bench.connection() as to:
