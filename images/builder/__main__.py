@@ -196,8 +196,8 @@ def main() -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("error: interrupted; the last good outputs are untouched", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"error: interrupted; {str(interrupt) or 'the last good outputs are untouched'}", file=sys.stderr)
         return 130
     return 0
 

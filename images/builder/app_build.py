@@ -139,7 +139,8 @@ def service(subject: app.App, description: app.Make, *, safe: bool) -> str:
     """A drop-in for flotilla-app@.service: a program instead of a task."""
     place = app.on_robot(subject.name)
     command = [str(place / Path(description.program).name), *description.arguments]
-    lines = ["[Service]", f"WorkingDirectory={place}"]
+    # At a task's nice value a program that computes at ordinary priority leaves 1 % of a processor to all others.
+    lines = ["[Service]", f"WorkingDirectory={place}", "Nice=0"]
     lines += ["ExecStart=", f"ExecStart={' '.join(map(_quoted, command))}", "ExecStopPost="]
     if safe:
         lines.append(f"ExecStopPost=/usr/bin/flotilla-run --safe {place / app.SAFE}")

@@ -49,14 +49,18 @@ def deploy(
     to: app_robot.Connection, directory: Path, board: Board, *, keep: bool, show: app_robot.Show, on_robot: bool = False
 ) -> str:
     """Build the app, here or on the robot, and bring it there. Then run it until it ends or KeyboardInterrupt ends it,
-    and report; or, to `keep` it, let it go on by itself, now and whenever the robot starts."""
+    and report; or, to `keep` it, let it go on by itself, now and whenever the robot starts. What interrupts it
+    says what the robot has of the app."""
     subject = app.load(directory)
     app.check_board(subject, to.robot, board)
-    place(to, subject, board, on_robot=on_robot)
-    if not keep:
-        return app_robot.run(to, subject.name, show)
-    app_robot.keep(to, subject.name)
-    return _start(to, subject.name)
+    try:
+        place(to, subject, board, on_robot=on_robot)
+        if not keep:
+            return app_robot.run(to, subject.name, show)
+        app_robot.keep(to, subject.name)
+        return _start(to, subject.name)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(app_robot.interrupted(to, subject.name)) from None
 
 
 def place(to: app_robot.Connection, subject: app.App, board: Board, *, on_robot: bool = False) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import shlex
+import signal
 import subprocess
 import sys
 import tarfile
@@ -107,7 +108,9 @@ def send(to: Connection, subject: app.App, board: Board, files: Path) -> None:
     need_kib = size // 1024 + _RESERVE_KIB
     program = _linked(subject)
     version = cache.digest(*sorted(files.iterdir()))[:16]
-    arguments = [version, board.machine, str(need_kib), program]
+    arguments = [version, str(need_kib), program]
+    # Before anything is sent, and by the connection that all share: what is cut off then ends on the robot at once.
+    to.run("fits", subject.name, board.machine)
     with progress.step(f"{subject.name} to {to.robot.name}, {progress.size(size)}"):
         to.run("receive", subject.name, *arguments, stdin=archive.getvalue())
 
@@ -138,48 +141,94 @@ def status(to: Connection, name: str) -> str:
     return to.run("status", name).strip()
 
 
+class _Interrupts:
+    """While it lasts, the first Ctrl-C ends the run and the second one this command, from before anything starts."""
+
+    def __init__(self) -> None:
+        self.any = False
+        self._run: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> _Interrupts:
+        self._before = signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def end(self, run: subprocess.Popen[str] | None = None) -> None:
+        """Let the run end now; with a run, whenever an interrupt says so."""
+        self._run = run or self._run
+        self.any = self.any or run is None
+        if self.any and self._run and self._run.stdin:
+            self._run.stdin.close()
+
+    def _handle(self, *_: object) -> None:
+        if self.any:
+            raise KeyboardInterrupt
+        self.end()
+
+
 def run(to: Connection, name: str, show: Show) -> str:
-    """Start it anew and show its log until it ends, or until KeyboardInterrupt ends it; its report."""
+    """Start it anew and show its log until it ends, or until KeyboardInterrupt ends it; its report.
+
+    It runs for as long as this does: the robot ends it when nobody listens any more.
+    """
     # In a session of its own: Ctrl-C ends the app and not the log, whose last lines say what came of it.
     argv = [*boot.DIE_WITH_PARENT, *to.argv("run", name)]
     log: list[str] = []
+    ended: dict[str, Any] = {}
+    cursor = ""
+
+    def take(line: str) -> None:
+        nonlocal ended, cursor
+        entry: dict[str, Any] = json.loads(line)
+        cursor = entry["__CURSOR"]
+        if entry.get("MESSAGE_ID") in _ENDED:
+            ended = entry
+        log.append(_message(entry))
+        show(log[-1])
+
     pipe = subprocess.PIPE
-    with subprocess.Popen(
-        argv, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True, start_new_session=True
-    ) as process:
+    with (
+        _Interrupts() as interrupts,
+        subprocess.Popen(argv, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as process,
+    ):
         assert process.stdout
         assert process.stderr
-
-        def take(line: str) -> dict[str, Any]:
-            entry: dict[str, Any] = json.loads(line)
-            log.append(_message(entry))
-            show(log[-1])
-            return entry
-
         try:
-            entry: dict[str, Any] = {}
-            interrupted = False
-            while entry.get("MESSAGE_ID") not in _ENDED:
+            interrupts.end(process)
+            cursor = process.stdout.readline().strip()
+            while not ended and (line := process.stdout.readline()).endswith("\n"):
                 try:
-                    if not (line := process.stdout.readline()):
-                        raise to.error(process.wait(), process.stderr.read())
-                    entry = take(line)
+                    take(line)
                 except KeyboardInterrupt:
-                    if interrupted:
-                        raise
-                    interrupted = True
-                    to.run("stop", name)
+                    interrupts.end()
+            if not ended and not interrupts.any:
+                raise to.error(process.wait(), process.stderr.read())
+        except KeyboardInterrupt:
+            to.run("stop", name)
+            raise
         finally:
             process.kill()
-    for line in to.run("rest", name, entry["__CURSOR"]).splitlines():
+    for line in to.run("rest", name, cursor).splitlines():
         take(line)
     _write(to, name, "log", "".join(f"{line}\n" for line in log))
     said = report(to, name)
-    if _ENDED[entry["MESSAGE_ID"]] != "success":
-        result = entry.get("UNIT_RESULT", "it failed")
+    if ended and _ENDED[ended["MESSAGE_ID"]] != "success":
+        result = ended.get("UNIT_RESULT", "it failed")
         remedy = f"its log is {paths.shown(_file(to, name, 'log'))}"
         raise UserError("\n".join(filter(None, (said, f"{to.robot.name}: {name} ended: {result}; {remedy}"))))
     return said
+
+
+def interrupted(to: Connection, name: str) -> str:
+    """What the robot has of the app now: for whoever interrupted a command that may have changed it."""
+    try:
+        told = dict(line.split("=", 1) for line in status(to, name).splitlines())
+    except UserError as error:
+        return str(error)
+    kept = "starts" if told["Kept"] == "yes" else "does not start"
+    return f"{to.robot.name}: {name} is {told['ActiveState']}, version {told['Version']}, and {kept} with the robot"
 
 
 def _message(entry: dict[str, Any]) -> str:

@@ -10,23 +10,48 @@ unit=flotilla-app@$name.service
 system=/etc/systemd/system
 wants=$system/multi-user.target.wants/$unit
 statistics=/var/lib/flotilla-apps/$name/statistics.json
+foreground=/run/systemd/system/$unit.d/foreground.conf
 
 refuse() {
     echo "$*" >&2
     exit 3
 }
 
-# Take the app's files from standard input, and put them in the place of what is there once nothing can fail any more:
-# VERSION of the files, the board's MACHINE as a pattern for uname's, KiB that must be free, PROGRAM or nothing.
-receive() {
-    version=$1 machine=$2 need=$3 program=$4
-    part=$apps/.$name.part
+# One command at a time changes an app; one that was cut off still comes to its end before another answers.
+own_apps() {
+    mkdir -p "$apps"
+    exec 8<"$apps"
+    flock -w 60 8 || refuse "another command has been changing its apps for a minute"
+}
+
+# Whether the app starts again when it has failed, as apps do that go on by themselves.
+restarts() {
+    [ "$1" = no ] || [ -e "$foreground" ] || return 0
+    [ "$1" = yes ] || [ ! -e "$foreground" ] || return 0
+    mkdir -p "${foreground%/*}"
+    if [ "$1" = no ]; then
+        printf '[Service]\nRestart=no\n' >"$foreground"
+    else
+        rm "$foreground"
+    fi
+    systemctl daemon-reload
+}
+
+# Refuse what is no robot for apps, or whose processor is not of the board's MACHINE, a pattern for uname's.
+fits() {
     # shellcheck disable=SC2254 # a pattern
     case $(uname -m) in
-    $machine) ;;
+    $1) ;;
     *) refuse "it is an $(uname -m), but its board in the inventory is not; nothing was changed" ;;
     esac
     [ -e /usr/lib/systemd/system/flotilla-app@.service ] || refuse "its image knows no apps; flash a new one"
+}
+
+# Take the app's files from standard input, and put them in the place of what is there once nothing can fail any more:
+# VERSION of the files, KiB that must be free, PROGRAM or nothing.
+receive() {
+    version=$1 need=$2 program=$3
+    part=$apps/.$name.part
     mkdir -p "$apps"
     rm -rf "$part"
     trap 'rm -rf "$part"' EXIT
@@ -136,6 +161,15 @@ forget() {
 }
 
 case $command in
+receive | keep | start | run | rest | stop | status | remove)
+    own_apps
+    ;;
+esac
+
+case $command in
+fits)
+    fits "$@"
+    ;;
 receive)
     receive "$@"
     ;;
@@ -158,22 +192,29 @@ keep) # start it with the robot
 start)
     there
     systemctl is-active -q "$unit" || forget
+    restarts yes
     systemctl start "$unit" || {
         journalctl -q -n 10 -o cat -u "$unit" >&2
         systemctl stop "$unit"
         refuse "$name does not start"
     }
     ;;
-run) # start it anew, and write its log until the connection ends
+run) # start it anew for as long as standard input lasts, which ends with the connection; write a cursor, then its log
     there
     systemctl stop "$unit"
     forget
+    restarts no
     cursor=$(journalctl -q -n 1 -o cat --show-cursor | sed -n 's/^-- cursor: //p')
+    echo "$cursor"
+    exec 8<&-
+    journalctl -q -f -o json --no-tail --after-cursor="$cursor" UNIT="$unit" + _SYSTEMD_UNIT="$unit" &
+    trap 'systemctl stop "$unit"; kill $!' EXIT
     systemctl start --no-block "$unit"
-    exec journalctl -q -f -o json --no-tail --after-cursor="$cursor" UNIT="$unit" + _SYSTEMD_UNIT="$unit"
+    cat >/dev/null
     ;;
 rest) # end it, and write its log from a cursor on
     systemctl stop "$unit"
+    [ "$1" ] || exit 0 # it never began
     journalctl --sync
     journalctl -q -o json --after-cursor="$1" UNIT="$unit" + _SYSTEMD_UNIT="$unit"
     ;;
@@ -199,7 +240,8 @@ status)
 remove)
     there
     systemctl stop "$unit"
-    rm -rf "$wants" "$system/$unit.d" "${apps:?}/$name" "$apps/.$name@"* "$apps/.$name.part" "${statistics%/*}"
+    forget # a failed unit without files would stay, and fail what asks for those
+    rm -rf "$wants" "$system/$unit.d" "${foreground%/*}" "${apps:?}/$name" "$apps/.$name@"* "$apps/.$name.part" "${statistics%/*}"
     systemctl daemon-reload
     sync -f "$apps"
     ;;
