@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import stat
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -163,6 +164,11 @@ def test_partition_table(robot_card: Card) -> None:
     ]
     assert _partition_table(robot_card.image) == expected
     assert robot_card.image.stat().st_size == card.SIZE
+
+
+def test_an_image_is_its_owners_alone(robot_card: Card) -> None:
+    """It holds the robot's private host key, whatever the umask was."""
+    assert stat.S_IMODE(robot_card.image.stat().st_mode) == 0o600
 
 
 def test_partition_table_as_another_program_reads_it(robot_card: Card) -> None:

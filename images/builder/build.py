@@ -86,7 +86,8 @@ def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) 
     final = image_of(robot, directory)
     work = directory / f".{robot.name}.part"
     cache.discard(work)
-    work.mkdir(parents=True)
+    directory.mkdir(parents=True, exist_ok=True)
+    work.mkdir(0o700)  # private keys are in what is made here
     new = work / final.name
     try:
         with ThreadPoolExecutor() as threads:

@@ -109,9 +109,14 @@ def extents(base_directory: Path) -> Extents:
 
 
 def begin(base_directory: Path, out: Path) -> Extents:
-    """Write the card `out` up to the robot's data partition. Only what holds anything is written."""
+    """Write the card `out` up to the robot's data partition. Only what holds anything is written.
+
+    It is for its owner alone: the data partition holds the robot's private key.
+    """
     whole = Partition(0, "card", 0, SIZE)
-    with out.open("wb") as card:
+    out.unlink(missing_ok=True)
+    out.touch(0o600, exist_ok=False)
+    with out.open("r+b") as card:
         card.truncate(SIZE)
         return _place(base_directory / "card.img", extents(base_directory), card.fileno(), whole)
 

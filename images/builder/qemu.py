@@ -161,6 +161,7 @@ def make_overlay(image: Path, overlay: Path, size: int = 0) -> None:
     if done.returncode:
         raise UserError(f"{paths.shown(overlay)}: qemu-img cannot make the overlay: {done.stderr.strip()}")
 
+    overlay.chmod(0o600)  # what the guest writes may be a private key
 
 def chardev(identifier: str, backend: str) -> str:
     """Argument of `-chardev`."""
