@@ -151,6 +151,22 @@ class Qemu(_Model):
     """Which `qemu-system-…`."""
     machine: Word
     """`-machine`, with version, so that another QEMU shows the guest the same machine."""
+class PortWrite(_Model):
+    """A byte written to an I/O port of the PC."""
+
+    port: Annotated[_Int, _between(0, 0xFFFF)]
+    value: Annotated[_Int, _between(0, 0xFF)]
+
+
+class Watchdog(_Model):
+    """How to reach the hardware watchdog without its driver. Once started it resets the board unless restarted."""
+
+    start: PortWrite
+    """Runs it for as long as it can wait, and starts the wait anew."""
+    stop: PortWrite
+    """Halts it."""
+
+
     cpu: Word
     """`-cpu`."""
     memory_mib: Annotated[_Int, _between(64, 65536)]
@@ -196,6 +212,8 @@ class Board(_Model):
         """What `uname -m` may say on it: a regular expression that is a pattern of the shell's, too."""
         return {"i386": "i[3-6]86", "amd64": "x86_64"}[self.architecture]
 
+    watchdog: Watchdog | None = None
+    """The boot loader starts it; the service manager takes it over through its driver, whose source says how."""
 
 class Ibss(_Model):
     """An 802.11 ad hoc cell. The BSSID is fixed, or cells split."""
