@@ -63,7 +63,7 @@ priority: 60
 blocks:
   drive:
     type: epos2
-    in: {{target: limit.out, enable: 1}}
+    in: {{target: limit.out, enable: 1, age: 0}}
     parameters: {{interface: can0, node: 3, mode: current, counts: 2000, gear: 10, heartbeat: 0.5, timeout: 0.5}}
   before: {{type: delay, in: {{in: drive.velocity}}}}
   controller:

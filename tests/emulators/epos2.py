@@ -57,6 +57,7 @@ class Abort(Exception):
     WRONG_LENGTH = 0x06070010
     NO_SUB_INDEX = 0x06090011
     OUT_OF_RANGE = 0x06090030
+    NOT_STORED = 0x08000020
     WRONG_STATE = 0x08000022
 
     def __init__(self, code: int) -> None:
@@ -78,6 +79,10 @@ class Entry:
 Name = tuple[int, int]
 COMMUNICATION = range(0x1000, 0x2000)
 PDO_OFF = 1 << 31
+HISTORY = 5
+"""Entries of object 1003."""
+SAVE = int.from_bytes(b"save", "little")
+"""What is written to 1010:1 to store all."""
 
 MODE_POSITION, MODE_VELOCITY, MODE_CURRENT = -1, -2, -3
 MODE_PROFILE_POSITION, MODE_PROFILE_VELOCITY = 1, 3
@@ -93,10 +98,14 @@ def shipped(node: int) -> dict[Name, Entry]:
     objects: dict[Name, Entry] = {
         (0x1000, 0): Entry(4, 0x00020192, access="ro"),
         (0x1001, 0): Entry(1, access="ro"),
-        (0x1003, 0): Entry(1),
+        (0x1003, 0): Entry(1, high=0),
+        **{(0x1003, sub): Entry(4, access="ro") for sub in range(1, HISTORY + 1)},
         (0x1005, 0): Entry(4, 0x80),
+        (0x1008, 0): Entry(4, int.from_bytes(b"EPOS", "little"), access="ro"),
         (0x100C, 0): Entry(2),
         (0x100D, 0): Entry(1),
+        (0x1010, 0): Entry(1, 1, access="ro"),
+        (0x1010, 1): Entry(4, 1),
         (0x1014, 0): Entry(4, 0x80 + node),
         (0x1016, 0): Entry(1, 2, access="ro"),
         (0x1016, 1): Entry(4),
@@ -104,6 +113,12 @@ def shipped(node: int) -> dict[Name, Entry]:
         (0x1017, 0): Entry(2),
         (0x1018, 0): Entry(1, 4, access="ro"),
         (0x1018, 1): Entry(4, 0x000000FB, access="ro"),
+        (0x1018, 2): Entry(4, access="ro"),
+        (0x1018, 3): Entry(4, access="ro"),
+        (0x1018, 4): Entry(4, access="ro"),
+        (0x1200, 0): Entry(1, 2, access="ro"),
+        (0x1200, 1): Entry(4, 0x600 + node, access="ro"),
+        (0x1200, 2): Entry(4, 0x580 + node, access="ro"),
         (0x6007, 0): _signed(2, value=1),
         (0x6040, 0): Entry(2, mapped="r"),
         (0x6041, 0): Entry(2, access="ro", mapped="t"),
@@ -129,6 +144,8 @@ def shipped(node: int) -> dict[Name, Entry]:
     second = [None, 0x60600008, 0x607A0020, 0x60FF0020], [None, 0x60610008, 0x60640020, 0x606C0020]
     for number in range(4):
         enabled = number == 0
+        objects[0x1400 + number, 0] = Entry(1, 2, access="ro")
+        objects[0x1800 + number, 0] = Entry(1, 3, access="ro")
         objects[0x1400 + number, 1] = Entry(4, 0x200 + 0x100 * number + node)
         objects[0x1400 + number, 2] = Entry(1, 255)
         objects[0x1800 + number, 1] = Entry(4, (0x40000180 if enabled else 0xC0000180) + 0x100 * number + node)
@@ -190,6 +207,7 @@ class Misbehaviour:
     loss: float = 0  # share of its frames that never arrive
     nonsense: float = 0  # frames of random content for each of its own
     stuck_axis: bool = False  # the axis ignores the control word
+    nmt_keeps_axis: bool = False  # the axis goes on whatever NMT commands
 
 
 class Epos2:
@@ -203,6 +221,7 @@ class Epos2:
         self._now = 0.0
         self._heard: float | None = None  # the master's last heartbeat
         self._out: list[Frame] = []
+        self.stored: dict[Name, int] = {}
         self.on = False
         self.power_on()
 
@@ -210,8 +229,18 @@ class Epos2:
 
     def power_on(self) -> None:
         self.on = True
+        self._reset_node()
+
+    def store(self, **values: int) -> None:
+        """Write objects and store all, as a tool does: `store(x1400_1=0x201)`."""
+        for name, value in values.items():
+            index, sub = name.removeprefix("x").split("_")
+            self.objects[int(index, 16), int(sub)].value = value
+        self._store()
+
+    def _reset_node(self) -> None:
         self.axis = Axis.SWITCH_ON_DISABLED
-        self.objects = shipped(self.node)
+        self.objects = self._restored()
         self.motor.turns = 0
         self._control = 0
         self._demand_rpm = 0.0
@@ -227,6 +256,9 @@ class Epos2:
     def fault(self, code: int, register: int = 0x01) -> None:
         """The drive finds an error: it tells, stops the motor and stays in Fault."""
         self.errors.append(code)
+        for sub, error in enumerate(self.errors[: -HISTORY - 1 : -1], 1):  # the newest first
+            self.objects[0x1003, sub].value = error
+        self.objects[0x1003, 0].value = min(len(self.errors), HISTORY)
         self.objects[0x1001, 0].value |= register
         self._emit(
             Frame(0x80 + self.node, code.to_bytes(2, "little") + bytes([self.objects[0x1001, 0].value, 0, 0, 0, 0, 0]))
@@ -277,6 +309,8 @@ class Epos2:
         elif identifier == self.objects[0x1005, 0].value & 0x7FF:
             self._synchronise()
         elif identifier == 0x600 + self.node and len(frame.data) == 8 and self.nmt is not Nmt.STOPPED:
+            if frame.data[0] == 0x80:
+                return  # the client gives up
             self._emit(Frame(0x580 + self.node, self._serve(frame.data)))
         elif identifier & 0x780 == 0x700:
             self._hear_heartbeat(identifier & 0x7F)
@@ -286,7 +320,7 @@ class Epos2:
     # --- CiA 301: NMT, heartbeat ---
 
     def _reset_communication(self) -> None:
-        fresh = shipped(self.node)
+        fresh = self._restored()
         for name in fresh:
             if name[0] in COMMUNICATION:
                 self.objects[name] = fresh[name]
@@ -296,6 +330,15 @@ class Epos2:
         self._sent: dict[int, tuple[bytes, float]] = {}
         self._emit(Frame(0x700 + self.node, bytes([Nmt.INITIALISING.value])))
 
+    def _restored(self) -> dict[Name, Entry]:
+        objects = shipped(self.node)
+        for name, value in self.stored.items():
+            objects[name].value = value
+        return objects
+
+    def _store(self) -> None:
+        self.stored = {name: entry.value for name, entry in self.objects.items() if entry.access == "rw"}
+
     def _command_nmt(self, command: int) -> None:
         if command == 0x01:
             self.nmt = Nmt.OPERATIONAL
@@ -303,12 +346,14 @@ class Epos2:
             if self.nmt is Nmt.OPERATIONAL:
                 self._lose_connection()
             self.nmt = Nmt.STOPPED if command == 0x02 else Nmt.PRE_OPERATIONAL
-            if command >= 0x81:
+            if command == 0x81:
+                self._reset_node()
+            elif command == 0x82:
                 self._reset_communication()
 
     def _lose_connection(self) -> None:
         """Abort connection option code 6007: what the axis does when nobody leads it any more."""
-        if self.axis in POWERED:
+        if self.axis in POWERED and not self.wrong.nmt_keeps_axis:
             self.axis = Axis.SWITCH_ON_DISABLED
 
     def _hear_heartbeat(self, node: int) -> None:
@@ -335,7 +380,8 @@ class Epos2:
             if request[0] >> 5 == 1:
                 if request[0] & 0x02 == 0:
                     raise Abort(Abort.BAD_COMMAND)  # segmented: no object here is longer than four bytes
-                size = 4 - (request[0] >> 2 & 3) if request[0] & 1 else 4
+                # Without a size in the request, the object's own.
+                size = 4 - (request[0] >> 2 & 3) if request[0] & 1 else self._entry(index, sub).size
                 self._write(index, sub, request[4 : 4 + size])
                 return bytes([0x60]) + request[1:4] + bytes(4)
             if request[0] >> 5 == 2:
@@ -367,6 +413,13 @@ class Epos2:
             self._check_mapping(index, sub, value)
         if (index, sub) == (0x6060, 0) and value not in MODES:
             raise Abort(Abort.OUT_OF_RANGE)
+        if (index, sub) == (0x1010, 1):
+            if value != SAVE:
+                raise Abort(Abort.NOT_STORED)
+            self._store()
+            return
+        if (index, sub) == (0x1003, 0):
+            self.errors.clear()
         entry.value = value
         self._written(index)
 

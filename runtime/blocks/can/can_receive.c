@@ -53,7 +53,7 @@ static int start(struct fl_block *block)
         .can_mask = ((canid_t)set->mask & (set->extended ? CAN_EFF_MASK : CAN_SFF_MASK)) | CAN_EFF_FLAG | CAN_RTR_FLAG,
     };
     fl_sensor_begin(&received->sensor);
-    return can_open(block, &received->can, set->interface, &filter, 1);
+    return can_start(block, &received->can, set->interface, &filter, 1);
 }
 
 static int step(struct fl_block *block)
@@ -70,14 +70,15 @@ static int step(struct fl_block *block)
         FL_OUT(block, IDENTIFIER, uint32_t) = frame.can_id & CAN_EFF_MASK;
         fl_sensor_update(&received->sensor, arrived_ns, received->sensor.sequence + 1);
     }
-    fl_sensor_outputs(&received->sensor, block, FLAG, !received->can.bus_off, set->timeout);
+    bool there = can_connected(&received->can) && !atomic_load(&received->can.bus_off);
+    fl_sensor_outputs(&received->sensor, block, FLAG, there, set->timeout);
     return FL_OK;
 }
 
 static void terminate(struct fl_block *block)
 {
     struct received *received = block->state;
-    can_close(&received->can);
+    can_stop(&received->can);
 }
 
 FL_BLOCK(can_receive) = {

@@ -34,7 +34,10 @@ static const struct fl_parameter parameters[] = {
 enum { DATA, AGE };
 enum { FLAG, SENT };
 static const struct fl_port outputs[] = {
-    {.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: the controller took the last frame"},
+    {.name = "flag",
+     .type = FL_BOOLEAN,
+     .width = 1,
+     .summary = "1: the controller took the last frame, and is on the bus"},
     {.name = "sent", .type = FL_UINT32, .width = 1, .summary = "frames that it took"},
 };
 
@@ -74,9 +77,9 @@ static int configure(struct fl_block *block)
     return fl_add_input(block, (struct fl_port){.name = "age",
                                                 .type = FL_DOUBLE,
                                                 .width = 1,
-                                                .flags = FL_OPTIONAL,
                                                 .unit = "s",
-                                                .summary = "age of the data; without a wire they are always new"});
+                                                .summary = "age of the data: the output `age` of their "
+                                                           "source, or 0 where they are constant"});
 }
 
 static int start(struct fl_block *block)
@@ -87,18 +90,21 @@ static int start(struct fl_block *block)
     sent->frame.len = (uint8_t)set->length;
     sent->reset = sent->frame;
     sent->resets = bytes_of(set->reset, sent->reset.data, CAN_MAX_DLEN) > 0;
-    return can_open(block, &sent->can, set->interface, NULL, 0); /* no filter: nothing is received */
+    return can_start(block, &sent->can, set->interface, NULL, 0); /* no filter: nothing but reports is received */
 }
 
 static int step(struct fl_block *block)
 {
     const struct can_send *set = block->parameters;
     struct sent *sent = block->state;
+    struct can_frame none;
+    int64_t arrived_ns;
+    can_receive(&sent->can, &none, &arrived_ns);
     bool fresh = FL_IN(block, AGE, double) <= set->timeout;
     memcpy(sent->frame.data, block->in[DATA], sent->frame.len);
     bool taken = (fresh || sent->resets) && can_send(&sent->can, fresh ? &sent->frame : &sent->reset);
     sent->count += taken;
-    FL_OUT(block, FLAG, uint8_t) = taken;
+    FL_OUT(block, FLAG, bool) = taken && can_connected(&sent->can) && !atomic_load(&sent->can.bus_off);
     FL_OUT(block, SENT, uint32_t) = sent->count;
     return FL_OK;
 }
@@ -106,7 +112,7 @@ static int step(struct fl_block *block)
 static void safe(struct fl_block *block)
 {
     struct sent *sent = block->state;
-    if (sent->can.fd > 0 && sent->resets)
+    if (sent->resets)
         can_send(&sent->can, &sent->reset);
 }
 
@@ -114,7 +120,7 @@ static void terminate(struct fl_block *block)
 {
     struct sent *sent = block->state;
     safe(block);
-    can_close(&sent->can);
+    can_stop(&sent->can);
 }
 
 FL_BLOCK(can_send) = {

@@ -13,6 +13,8 @@ enum {
     COB_TPDO3 = 0x380,
     COB_TPDO4 = 0x480,
     COB_RPDO1 = 0x200,
+    COB_RPDO2 = 0x300,
+    COB_RPDO3 = 0x400,
     COB_RPDO4 = 0x500,
     COB_SDO_ANSWER = 0x580,
     COB_SDO_REQUEST = 0x600,
@@ -115,12 +117,10 @@ static void map_pdo(struct epos2 *drive, uint16_t index, uint32_t off, uint32_t 
     uint16_t mapping = (uint16_t)(index + MAPPING);
     write_object(drive, index, 1, 4, off);
     write_object(drive, index, 2, 1, transmission);
-    if (count) {
-        write_object(drive, mapping, 0, 1, 0);
-        for (uint8_t i = 0; i < count; i++)
-            write_object(drive, mapping, (uint8_t)(i + 1), 4, objects[i]);
-        write_object(drive, mapping, 0, 1, count);
-    }
+    write_object(drive, mapping, 0, 1, 0);
+    for (uint8_t i = 0; i < count; i++)
+        write_object(drive, mapping, (uint8_t)(i + 1), 4, objects[i]);
+    write_object(drive, mapping, 0, 1, count);
     write_object(drive, index, 1, 4, on);
 }
 
@@ -129,12 +129,20 @@ static void list_writes(struct epos2 *drive)
     const struct epos2_settings *set = &drive->settings;
     const uint32_t command[] = {0x60400010, modes[set->mode].target};
     const uint32_t motion[] = {0x60410010, 0x606C0020, 0x60780010};
+    const uint32_t mode[] = {0x60410010, 0x60610008};
+    const uint32_t position[] = {0x60410010, 0x60640020};
     drive->write_count = drive->write_next = 0;
     write_object(drive, 0x6040, 0, 2, DISABLE_VOLTAGE);
     write_object(drive, 0x6060, 0, 1, (uint8_t)modes[set->mode].mode);
+    map_pdo(drive, 0x1400, RPDO_OFF + COB_RPDO1 + set->node, COB_RPDO1 + set->node, AT_ONCE, command, 1);
+    /* What is not used is off: the drive may have stored an identifier for it that another node uses. TPDO1 would only
+     * repeat the status word of the others, and overtake them on the bus. */
+    write_object(drive, 0x1401, 1, 4, RPDO_OFF + COB_RPDO2 + set->node);
+    write_object(drive, 0x1402, 1, 4, RPDO_OFF + COB_RPDO3 + set->node);
+    write_object(drive, 0x1800, 1, 4, PDO_OFF + COB_TPDO1 + set->node);
     map_pdo(drive, 0x1403, RPDO_OFF + COB_RPDO4 + set->node, COB_RPDO4 + set->node, AT_ONCE, command, 2);
-    map_pdo(drive, 0x1801, PDO_OFF + COB_TPDO2 + set->node, TPDO_ON + COB_TPDO2 + set->node, EACH_SYNC, NULL, 0);
-    map_pdo(drive, 0x1802, PDO_OFF + COB_TPDO3 + set->node, TPDO_ON + COB_TPDO3 + set->node, EACH_SYNC, NULL, 0);
+    map_pdo(drive, 0x1801, PDO_OFF + COB_TPDO2 + set->node, TPDO_ON + COB_TPDO2 + set->node, EACH_SYNC, mode, 2);
+    map_pdo(drive, 0x1802, PDO_OFF + COB_TPDO3 + set->node, TPDO_ON + COB_TPDO3 + set->node, EACH_SYNC, position, 2);
     map_pdo(drive, 0x1803, PDO_OFF + COB_TPDO4 + set->node, TPDO_ON + COB_TPDO4 + set->node, EACH_SYNC, motion, 3);
     if (set->max_rpm) {
         write_object(drive, 0x607F, 0, 4, set->max_rpm);
@@ -156,14 +164,19 @@ static void list_writes(struct epos2 *drive)
 
 static void enter(struct epos2 *drive, enum epos2_phase phase, int64_t now_ns)
 {
+    if (drive->phase == EPOS2_RUNNING)
+        drive->armed = false;
     drive->phase = phase;
     drive->phase_ns = now_ns;
     drive->sdo_waiting = false;
+    drive->reset_sent = false;
     drive->status_known = false;
     drive->have_position = false;
     drive->stopping = false;
     drive->setpoint_state = SETPOINT_NONE;
     drive->mode_display = 0;
+    drive->control_word = DISABLE_VOLTAGE;
+    drive->status_before = 0x0008; /* one that is found in fault was not seen to fail */
     if (phase == EPOS2_CONFIGURING)
         list_writes(drive);
 }
@@ -172,13 +185,18 @@ void epos2_begin(struct epos2 *drive, const struct epos2_settings *settings)
 {
     memset(drive, 0, sizeof *drive);
     drive->settings = *settings;
-    enter(drive, EPOS2_BOOTING, INT64_MIN / 2); /* long ago: the first reset is due */
+    epos2_lose(drive);
     drive->heartbeat_ns = drive->reset_ns = INT64_MIN / 2;
+}
+
+void epos2_lose(struct epos2 *drive)
+{
+    enter(drive, EPOS2_BOOTING, INT64_MIN / 2); /* long ago: the first reset is due */
 }
 
 void epos2_identifiers(const struct epos2_settings *settings, uint32_t identifiers[EPOS2_IDENTIFIERS])
 {
-    static const uint32_t bases[EPOS2_IDENTIFIERS] = {COB_EMCY,  COB_TPDO1,      COB_TPDO2,    COB_TPDO3,
+    static const uint32_t bases[EPOS2_IDENTIFIERS] = {COB_EMCY,  COB_TPDO2,      COB_TPDO3,
                                                       COB_TPDO4, COB_SDO_ANSWER, COB_HEARTBEAT};
     for (size_t i = 0; i < EPOS2_IDENTIFIERS; i++)
         identifiers[i] = bases[i] + settings->node;
@@ -225,6 +243,7 @@ static void take_answer(struct epos2 *drive, const uint8_t *data, int64_t at_ns)
     if (data[0] == ABORTED) {
         drive->abort_code = get(data + 4, 4);
         drive->abort_write = *write;
+        drive->trouble = (struct epos2_trouble){EPOS2_ABORTED, write->index, write->sub, drive->abort_code};
         enter(drive, EPOS2_REFUSED, at_ns);
     } else if (data[0] == DOWNLOADED) {
         drive->sdo_waiting = false;
@@ -232,11 +251,27 @@ static void take_answer(struct epos2 *drive, const uint8_t *data, int64_t at_ns)
     }
 }
 
+static void blame(struct epos2 *drive, enum epos2_cause cause)
+{
+    if (drive->trouble.cause == EPOS2_FINE)
+        drive->trouble = (struct epos2_trouble){.cause = cause};
+}
+
+/* An error code, or 0: the drive has none any more. */
+static void take_emergency(struct epos2 *drive, uint16_t code)
+{
+    drive->error_code = code;
+    if (code)
+        drive->trouble = (struct epos2_trouble){.cause = EPOS2_EMERGENCY, .code = code};
+    else if (drive->trouble.cause == EPOS2_EMERGENCY)
+        drive->trouble.cause = EPOS2_FINE;
+}
+
 static void take_status(struct epos2 *drive, const uint8_t *data)
 {
     uint16_t status_word = (uint16_t)get(data, 2);
     if (axis_of(drive->status_word) == FAULT && axis_of(status_word) != FAULT)
-        drive->error_code = 0;
+        take_emergency(drive, 0);
     drive->status_word = status_word;
     drive->status_known = true;
 }
@@ -282,11 +317,7 @@ void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t a
         break;
     case COB_EMCY:
         if (frame->len == 8)
-            drive->error_code = (uint16_t)get(data, 2);
-        break;
-    case COB_TPDO1:
-        if (drive->phase == EPOS2_RUNNING && frame->len == 2)
-            take_status(drive, data);
+            take_emergency(drive, (uint16_t)get(data, 2));
         break;
     case COB_TPDO2:
         if (drive->phase == EPOS2_RUNNING && frame->len == 3) {
@@ -385,21 +416,45 @@ static uint16_t fault_word(struct epos2 *drive, int64_t now_ns)
     return FAULT_RESET;
 }
 
+static bool is_fault(enum axis axis)
+{
+    return axis == FAULT || axis == FAULT_REACTION;
+}
+
+/* It has a fault now, or left operation while it was told to stay there. */
+static bool has_failed(const struct epos2 *drive)
+{
+    enum axis before = axis_of(drive->status_before), axis = axis_of(drive->status_word);
+    bool left = before == OPERATION_ENABLED && axis != OPERATION_ENABLED;
+    return (is_fault(axis) && !is_fault(before)) ||
+           (left && (drive->control_word & ENABLE_OPERATION) == ENABLE_OPERATION);
+}
+
+/* Whether the motor may be on, by what `enable` has done. */
+static bool is_armed(struct epos2 *drive, bool enable)
+{
+    bool there = drive->phase == EPOS2_RUNNING && drive->status_known;
+    bool edge = enable && !drive->was_enabled && (there || !drive->contacted);
+    if (there && has_failed(drive))
+        drive->armed = false;
+    drive->was_enabled = enable;
+    drive->armed = enable && (drive->armed || edge);
+    drive->reset_wanted = enable && (drive->reset_wanted || edge);
+    return drive->armed || (enable && drive->settings.automatic_restart);
+}
+
 /* The one word that brings the axis a step nearer to what is wanted: each state is acknowledged by the status word
  * before the next is asked for. */
-static uint16_t control_word(struct epos2 *drive, int64_t now_ns, bool enable, bool wanted, int32_t *target)
+static uint16_t control_word(struct epos2 *drive, int64_t now_ns, bool commanded, bool armed, int32_t *target)
 {
     enum axis axis = axis_of(drive->status_word);
-    if (enable && !drive->was_enabled)
-        drive->reset_wanted = true;
-    drive->was_enabled = enable;
     if (axis != OPERATION_ENABLED)
         drive->setpoint_state = SETPOINT_NONE;
     if (axis == FAULT)
-        return wanted ? fault_word(drive, now_ns) : DISABLE_VOLTAGE;
+        return commanded ? fault_word(drive, now_ns) : DISABLE_VOLTAGE;
     if (axis != FAULT_REACTION)
         drive->reset_wanted = false;
-    if (!wanted)
+    if (!commanded || !armed)
         return stop_word(drive, axis, now_ns);
     drive->stopping = false;
     if (drive->mode_display != modes[drive->settings.mode].mode)
@@ -437,9 +492,8 @@ static int32_t idle_target(const struct epos2 *drive)
 
 /* --- transmission --- */
 
-static struct can_frame sdo(const struct epos2 *drive)
+static struct can_frame sdo(const struct epos2 *drive, const struct epos2_write *write)
 {
-    const struct epos2_write *write = &drive->writes[drive->write_next];
     struct can_frame frame = frame_of(COB_SDO_REQUEST + drive->settings.node, 8);
     frame.data[0] = (uint8_t)(0x23 | (4 - write->size) << 2); /* expedited download of `size` bytes */
     put(frame.data + 1, 2, write->index);
@@ -448,32 +502,48 @@ static struct can_frame sdo(const struct epos2 *drive)
     return frame;
 }
 
+static bool boot(struct epos2 *drive, int64_t now_ns, struct can_frame *out)
+{
+    if (now_ns - drive->phase_ns < boot_retry_ns)
+        return false;
+    if (drive->reset_sent)
+        blame(drive, EPOS2_NO_ANSWER);
+    drive->reset_sent = true;
+    drive->phase_ns = now_ns;
+    *out = nmt(drive, NMT_RESET_COMMUNICATION);
+    return true;
+}
+
 static bool configure(struct epos2 *drive, int64_t now_ns, struct can_frame *out)
 {
     if (drive->sdo_waiting) {
-        if (now_ns - drive->sdo_ns > sdo_timeout_ns)
-            enter(drive, EPOS2_BOOTING, now_ns - boot_retry_ns); /* gone, or it lost a frame: from the beginning */
+        if (now_ns - drive->sdo_ns > sdo_timeout_ns) { /* gone, or it lost a frame: from the beginning */
+            blame(drive, EPOS2_NO_ANSWER);
+            enter(drive, EPOS2_BOOTING, now_ns - boot_retry_ns);
+        }
         return false;
     }
-    *out = sdo(drive);
+    *out = sdo(drive, &drive->writes[drive->write_next]);
     drive->sdo_waiting = true;
     drive->sdo_ns = now_ns;
     return true;
 }
 
-static size_t run(struct epos2 *drive, int64_t now_ns, const struct epos2_command *command, struct can_frame *out)
+static size_t run(struct epos2 *drive, int64_t now_ns, const struct epos2_command *command, bool armed,
+                  struct can_frame *out)
 {
     size_t count = 0;
     if (!drive->status_known) {
         out[count++] = nmt(drive, NMT_START);
     } else {
-        bool wanted = command->enable && isfinite(command->target);
-        int32_t target = wanted ? target_of(&drive->settings, command->target) : idle_target(drive);
-        uint16_t word = control_word(drive, now_ns, command->enable, wanted, &target);
+        bool commanded = command->enable && isfinite(command->target);
+        int32_t target = commanded ? target_of(&drive->settings, command->target) : idle_target(drive);
+        uint16_t word = control_word(drive, now_ns, commanded, armed, &target);
+        drive->control_word = word;
+        drive->status_before = drive->status_word;
         bool operating = (word & ENABLE_OPERATION) == ENABLE_OPERATION;
         out[count++] = command_frame(drive, word, operating ? target : idle_target(drive));
     }
-    out[count++] = frame_of(COB_SYNC, 0);
     return count;
 }
 
@@ -490,34 +560,37 @@ size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_com
     if (drive->phase == EPOS2_CONFIGURING && drive->write_next == drive->write_count) {
         enter(drive, EPOS2_RUNNING, now_ns);
         drive->heard_ns = now_ns;
+        drive->contacted = true;
         drive->abort_code = 0;
+        if (drive->trouble.cause != EPOS2_EMERGENCY)
+            drive->trouble.cause = EPOS2_FINE;
     }
-    if (drive->phase == EPOS2_RUNNING && now_ns - drive->heard_ns > silence_ns)
+    if (drive->phase == EPOS2_RUNNING && now_ns - drive->heard_ns > silence_ns) {
+        blame(drive, EPOS2_NO_HEARTBEAT);
         enter(drive, EPOS2_BOOTING, now_ns - boot_retry_ns);
+    }
     if (drive->phase == EPOS2_REFUSED && now_ns - drive->phase_ns >= refused_retry_ns)
         enter(drive, EPOS2_BOOTING, now_ns - boot_retry_ns);
-    switch (drive->phase) {
-    case EPOS2_BOOTING:
-        if (now_ns - drive->phase_ns >= boot_retry_ns) {
-            drive->phase_ns = now_ns;
-            out[count++] = nmt(drive, NMT_RESET_COMMUNICATION);
-        }
-        return count;
-    case EPOS2_CONFIGURING:
-        return count + configure(drive, now_ns, &out[count]);
-    case EPOS2_RUNNING:
-        return count + run(drive, now_ns, command, &out[count]);
-    case EPOS2_REFUSED:
-    default:
-        return count;
-    }
+    bool armed = is_armed(drive, command->enable);
+    if (drive->phase == EPOS2_BOOTING)
+        count += boot(drive, now_ns, &out[count]);
+    else if (drive->phase == EPOS2_CONFIGURING)
+        count += configure(drive, now_ns, &out[count]);
+    else if (drive->phase == EPOS2_RUNNING)
+        count += run(drive, now_ns, command, armed, &out[count]);
+    if (command->sync)
+        out[count++] = frame_of(COB_SYNC, 0);
+    return count;
 }
 
 size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])
 {
-    out[0] = frame_of(COB_RPDO1 + drive->settings.node, 2);
-    put(out[0].data, 2, DISABLE_VOLTAGE);
-    return 1;
+    const struct epos2_write word = {0x6040, 0, 2, DISABLE_VOLTAGE};
+    out[0] = command_frame(drive, DISABLE_VOLTAGE, idle_target(drive));
+    out[1] = frame_of(COB_RPDO1 + drive->settings.node, 2);
+    put(out[1].data, 2, DISABLE_VOLTAGE);
+    out[2] = sdo(drive, &word);
+    return 3;
 }
 
 size_t epos2_farewell(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])

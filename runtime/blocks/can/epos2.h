@@ -3,9 +3,14 @@
  *
  * It brings the drive from any state into operation and keeps it there: reset of its communication, configuration by
  * SDO with every answer checked, NMT start, then the state machine of CiA 402, one acknowledged transition after the
- * other. Values are sampled by SYNC, once per call of epos2_advance. Both sides send heartbeats: a drive that is
- * silent is taken for gone and begun anew, and a drive that misses ours stops its motor by itself. Ours are sent by
- * epos2_advance only: whatever stops the control task stops the motor.
+ * other. Of what the drive has stored, no identifier and no mapping is relied upon: all of its PDOs are written.
+ * Values are sampled by SYNC. Both sides send heartbeats: a drive that is silent is taken for gone and begun anew, and
+ * a drive that misses ours stops its motor by itself. Ours are sent by epos2_advance only: whatever stops the control
+ * task stops the motor.
+ *
+ * The motor is switched on by `enable` going from 0 to 1. Once the drive had a fault, was lost, or left operation by
+ * itself, it takes another such edge, given while the drive is there. Only before the first contact an edge waits for
+ * the drive.
  *
  * Sources: CiA 301 4.2, CiA 402-2; Maxon, EPOS2 Firmware Specification, and the drive's EDS for what is shipped. */
 #ifndef FLOTILLA_EPOS2_H
@@ -30,10 +35,12 @@ struct epos2_settings {
     uint32_t stop_rpm_per_s; /* deceleration of a quick stop */
     uint16_t limit_ma;       /* output current */
     bool automatic_reset;    /* of faults, once a second; otherwise only by switching `enable` on again */
+    bool automatic_restart;  /* of the motor, as soon as the drive is able to; otherwise only by `enable`, likewise */
 };
 
 struct epos2_command {
     bool enable;
+    bool sync;     /* end with a SYNC: for all drives on the bus, so one of them in each period */
     double target; /* rad, rad/s or A, by mode; one that is not finite is no command: the motor is stopped */
 };
 
@@ -48,8 +55,24 @@ enum epos2_phase {
     EPOS2_REFUSED, /* it aborted a configuration; begun anew after a second */
 };
 
+/* Why the drive does not work: the first cause, until it works again. */
+enum epos2_cause {
+    EPOS2_FINE,
+    EPOS2_NO_ANSWER,    /* to a reset of its communication, or to an SDO */
+    EPOS2_NO_HEARTBEAT, /* it worked, and fell silent */
+    EPOS2_ABORTED,      /* it refused an object: `code` is the abort code */
+    EPOS2_EMERGENCY,    /* `code` is the error code of its EMCY message */
+};
+
+struct epos2_trouble {
+    enum epos2_cause cause;
+    uint16_t index; /* of the object refused */
+    uint8_t sub;
+    uint32_t code;
+};
+
 enum {
-    EPOS2_WRITES = 40, /* SDOs of a configuration, at most */
+    EPOS2_WRITES = 56, /* SDOs of a configuration, at most */
     EPOS2_FRAMES = 4,  /* frames of one call, at most */
 };
 
@@ -64,11 +87,15 @@ struct epos2 {
     struct epos2_write writes[EPOS2_WRITES];
     size_t write_count, write_next;
     enum epos2_phase phase;
-    bool sdo_waiting;
+    bool sdo_waiting, reset_sent;
     int64_t phase_ns, sdo_ns;       /* begin of the phase, of the SDO that waits */
     int64_t heard_ns, heartbeat_ns; /* its last heartbeat, ours */
     int64_t stop_ns, reset_ns;      /* begin of a quick stop, the last fault reset */
     bool stopping, reset_wanted, was_enabled;
+    bool contacted; /* it has been in operation */
+    bool armed;     /* `enable` has gone from 0 to 1 since the drive last failed */
+    uint16_t control_word;
+    uint16_t status_before; /* at the last control word */
     bool have_position;
     int64_t position_ns;
     int32_t counts;
@@ -82,16 +109,20 @@ struct epos2 {
     uint16_t error_code; /* of its last EMCY message; 0: none since the fault was reset */
     uint32_t abort_code; /* of the SDO that was refused last; 0: none */
     struct epos2_write abort_write;
+    struct epos2_trouble trouble;
     struct epos2_values values;
     int64_t values_ns; /* when the older of them arrived */
     uint32_t sequence; /* complete sets of values */
 };
 
 /* The addresses from which the drive speaks, to be let through by the kernel's filter; their number. */
-enum { EPOS2_IDENTIFIERS = 7 };
+enum { EPOS2_IDENTIFIERS = 6 };
 void epos2_identifiers(const struct epos2_settings *settings, uint32_t identifiers[EPOS2_IDENTIFIERS]);
 
 void epos2_begin(struct epos2 *drive, const struct epos2_settings *settings);
+
+/* The connection to the bus was interrupted: begin the drive anew at the next epos2_advance. */
+void epos2_lose(struct epos2 *drive);
 
 /* Take a frame that arrived at `at_ns`. Any may come; those that are not the drive's, or malformed, change nothing. */
 void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t at_ns);
@@ -100,8 +131,9 @@ void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t a
 size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_command *command,
                      struct can_frame out[EPOS2_FRAMES]);
 
-/* The frames that take the power off the motor, in every phase: RPDO1, which carries the control word alone, stays as
- * the drive is shipped. So this also stops a drive that a program before this one has left running. */
+/* The frames that take the power off the motor, in every phase: by the PDO of the commands, by RPDO1, which carries the
+ * control word alone, and by SDO, which no setting of the drive changes. So this also stops a drive that a program
+ * before this one has left running. */
 size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
 
 /* The frames after the last: powerless, and no longer waiting for our heartbeats. */

@@ -1,7 +1,9 @@
-/* The block `epos2`: the drive of epos2.h on a CAN interface. It has no thread: a step takes what the kernel has
- * stamped and queued, and hands over what is to be sent, and neither can block. */
+/* The block `epos2`: the drive of epos2.h on a CAN interface. A step takes what the kernel has stamped and
+ * queued, and hands over what is to be sent, and neither can block; the thread of socket.h waits for the interface. */
 #include "epos2.h"
+#include "epos2_text.h"
 #include "socket.h"
+#include "sync.h"
 
 #include <flotilla/sensor.h>
 #include <math.h>
@@ -11,14 +13,19 @@ struct epos2_block {
     int64_t node, master;
     int mode;
     double counts, gear, heartbeat, max_velocity, acceleration, stop_deceleration, max_current, timeout;
-    int fault_reset;
+    int fault_reset, restart, sync;
 };
 
 struct state {
     struct can_socket can;
+    struct can_sync sync;
     struct epos2 drive;
     struct fl_sensor sensor;
-    bool open;
+    uint32_t connections;       /* of the interface, that the drive was begun on */
+    struct fl_ring troubles;    /* from the step to the thread, for the journal */
+    struct epos2_trouble known; /* the step has put into it */
+    struct epos2_trouble now, told;
+    int64_t since_ns; /* of `now` */
 };
 
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
@@ -48,6 +55,12 @@ static const struct fl_parameter parameters[] = {
                  .summary = "age from which a command, or a measurement, is too old"),
     FL_PARAMETER(struct epos2_block, fault_reset, .fallback = "enable", .choices = "enable|automatic",
                  .summary = "what resets a fault: `enable` going from 0 to 1, or also the block, once a second"),
+    FL_PARAMETER(struct epos2_block, restart, .fallback = "enable", .choices = "enable|automatic",
+                 .summary = "what switches the motor on again after a fault, or after the drive or the bus was lost: "
+                            "`enable` going from 0 to 1, or also the block, as soon as it can"),
+    FL_PARAMETER(struct epos2_block, sync, .fallback = "shared", .choices = "shared|none",
+                 .summary = "who sends SYNC: one of the blocks on the interface with `shared`, whatever tasks of this "
+                            "computer they are in, once in its period; or another computer on the bus"),
 };
 
 enum { TARGET, ENABLE, COMMAND_AGE };
@@ -57,9 +70,9 @@ static const struct fl_port inputs[] = {
     {.name = "age",
      .type = FL_DOUBLE,
      .width = 1,
-     .flags = FL_OPTIONAL,
      .unit = "s",
-     .summary = "age of the command, which is as good as none beyond `timeout`; without a wire it is always new"},
+     .summary = "age of the command, as good as none beyond `timeout`: the output `age` of its source, or 0 where it "
+                "is constant"},
 };
 
 enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, FLAG };
@@ -97,6 +110,7 @@ static struct epos2_settings settings_of(const struct epos2_block *set)
         .stop_rpm_per_s = whole(set->stop_deceleration * rpm, UINT32_MAX),
         .limit_ma = (uint16_t)lround(set->max_current * 1e3),
         .automatic_reset = set->fault_reset == 1,
+        .automatic_restart = set->restart == 1,
     };
 }
 
@@ -111,8 +125,70 @@ static int configure(struct fl_block *block)
     return FL_OK;
 }
 
+static bool same(const struct epos2_trouble *a, const struct epos2_trouble *b)
+{
+    return a->cause == b->cause && a->code == b->code && a->index == b->index && a->sub == b->sub;
+}
+
+static void tell(struct fl_block *block, const struct epos2_trouble *trouble)
+{
+    const struct epos2_block *set = block->parameters;
+    int node = (int)set->node;
+    switch (trouble->cause) {
+    case EPOS2_NO_ANSWER:
+        fl_log(block, "drive %d does not answer: check its power, cable, node address and bit rate; trying on", node);
+        break;
+    case EPOS2_NO_HEARTBEAT:
+        fl_log(block, "drive %d: no heartbeat for %g s: check its power and cable; trying on", node, set->heartbeat);
+        break;
+    case EPOS2_ABORTED:
+        fl_log(block, "drive %d refuses object %04X:%02X: SDO abort code %08X, %s; trying on", node, trouble->index,
+               trouble->sub, (unsigned)trouble->code, epos2_abort_text(trouble->code));
+        break;
+    case EPOS2_EMERGENCY:
+        fl_log(block, "drive %d has a fault: EMCY error code %04X, %s", node, (unsigned)trouble->code,
+               epos2_error_text((uint16_t)trouble->code));
+        break;
+    case EPOS2_FINE:
+    default:
+        fl_log(block, "drive %d works again", node);
+        break;
+    }
+}
+
+/* By the thread. A trouble that returns at once, as a fault that is reset each second, is said once. */
+static void watch(struct fl_block *block)
+{
+    const int64_t fine_ns = INT64_C(2000000000);
+    const struct epos2_block *set = block->parameters;
+    struct state *state = block->state;
+    int64_t now_ns = fl_now_ns();
+    if (set->sync == 0)
+        can_sync_claim(&state->sync, set->interface);
+    while (fl_ring_take(&state->troubles, &state->now)) {
+        state->since_ns = now_ns;
+        if (state->now.cause == EPOS2_FINE || same(&state->now, &state->told))
+            continue;
+        tell(block, &state->now);
+        state->told = state->now;
+    }
+    if (state->now.cause == EPOS2_FINE && state->told.cause != EPOS2_FINE && now_ns - state->since_ns >= fine_ns) {
+        tell(block, &state->now);
+        state->told = state->now;
+    }
+}
+
+/* From the step to the thread. What does not fit is put by the next step. */
+static void report(struct state *state)
+{
+    const struct epos2_trouble *trouble = &state->drive.trouble;
+    if (!same(trouble, &state->known) && fl_ring_put(&state->troubles, trouble))
+        state->known = *trouble;
+}
+
 static int start(struct fl_block *block)
 {
+    enum { TROUBLES = 16 };
     const struct epos2_block *set = block->parameters;
     struct state *state = block->state;
     struct epos2_settings settings = settings_of(set);
@@ -122,11 +198,15 @@ static int start(struct fl_block *block)
     epos2_identifiers(&settings, identifiers);
     for (size_t i = 0; i < EPOS2_IDENTIFIERS; i++)
         filters[i] = (struct can_filter){identifiers[i], CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
-    if (can_open(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS) != FL_OK)
+    void *troubles = fl_allocate(block, fl_ring_bytes(sizeof(struct epos2_trouble), TROUBLES));
+    if (!troubles)
         return FL_FAILED;
-    state->open = true;
+    fl_ring_initialize(&state->troubles, troubles, sizeof(struct epos2_trouble), TROUBLES);
     fl_sensor_begin(&state->sensor);
-    return FL_OK;
+    if (set->sync == 0)
+        can_sync_claim(&state->sync, set->interface); /* the first block that starts */
+    state->can.watch = watch;
+    return can_start(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS);
 }
 
 static void send_all(struct state *state, const struct can_frame *frames, size_t count)
@@ -142,7 +222,8 @@ static void show(struct fl_block *block, struct state *state)
     const struct epos2 *drive = &state->drive;
     if (drive->sequence != state->sensor.sequence)
         fl_sensor_update(&state->sensor, drive->values_ns, drive->sequence);
-    fl_sensor_outputs(&state->sensor, block, FLAG, drive->phase == EPOS2_RUNNING && !state->can.bus_off, set->timeout);
+    bool there = drive->phase == EPOS2_RUNNING && can_connected(&state->can) && !atomic_load(&state->can.bus_off);
+    fl_sensor_outputs(&state->sensor, block, FLAG, there, set->timeout);
     FL_OUT(block, POSITION, double) = drive->values.position;
     FL_OUT(block, VELOCITY, double) = drive->values.velocity;
     FL_OUT(block, CURRENT, double) = drive->values.current;
@@ -150,6 +231,15 @@ static void show(struct fl_block *block, struct state *state)
     FL_OUT(block, ERROR, uint16_t) = drive->error_code;
     FL_OUT(block, ABORT, uint32_t) = drive->abort_code;
     FL_OUT(block, ENABLED, uint8_t) = FL_OUT(block, FLAG, bool) && epos2_enabled(drive);
+}
+
+/* A drive that could not be reached for a while is in any state: it is begun anew. */
+static void follow_interface(struct state *state)
+{
+    uint32_t connections = atomic_load(&state->can.connections);
+    if (connections != state->connections)
+        epos2_lose(&state->drive);
+    state->connections = connections;
 }
 
 static int step(struct fl_block *block)
@@ -163,8 +253,13 @@ static int step(struct fl_block *block)
         epos2_receive(&state->drive, &frame, arrived_ns);
     bool fresh = FL_IN(block, COMMAND_AGE, double) <= set->timeout;
     struct epos2_command command = {.enable = FL_IN(block, ENABLE, uint8_t),
+                                    .sync = atomic_load(&state->sync.mine),
                                     .target = fresh ? FL_IN(block, TARGET, double) : (double)NAN};
-    send_all(state, out, epos2_advance(&state->drive, block->release_ns, &command, out));
+    follow_interface(state);
+    /* On an interface that is away nothing is begun: what a driver has queued would reach the drive late. */
+    if (can_connected(&state->can))
+        send_all(state, out, epos2_advance(&state->drive, block->release_ns, &command, out));
+    report(state);
     show(block, state);
     return FL_OK;
 }
@@ -173,18 +268,16 @@ static void safe(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    if (state->open)
-        send_all(state, out, epos2_disable(&state->drive, out));
+    send_all(state, out, epos2_disable(&state->drive, out));
 }
 
 static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    if (state->open)
-        send_all(state, out, epos2_farewell(&state->drive, out));
-    state->open = false;
-    can_close(&state->can);
+    send_all(state, out, epos2_farewell(&state->drive, out));
+    can_stop(&state->can);
+    can_sync_release(&state->sync);
 }
 
 FL_BLOCK(epos2) = {

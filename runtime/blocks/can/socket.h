@@ -1,28 +1,54 @@
-/* A SocketCAN raw socket (Linux, Documentation/networking/can.rst) that never blocks, with the kernel's filters and
- * time stamps. */
+/* A SocketCAN raw socket (Linux, Documentation/networking/can.rst) with the kernel's filters and time stamps, which
+ * never blocks the step, and the thread that waits for its interface.
+ *
+ * The interface need not be there when the block starts: the thread looks for it ten times a second, binds the socket
+ * as soon as it appears, again whenever it was removed, and says once in the journal what is missing and what to do
+ * about it. The descriptor stays the same as long as the block lives, so the step can use it at any time. */
 #ifndef FLOTILLA_CAN_SOCKET_H
 #define FLOTILLA_CAN_SOCKET_H
 
-#include <flotilla/block.h>
+#include <flotilla/driver.h>
 #include <linux/can.h>
+#include <stdatomic.h>
+
+enum { CAN_FILTERS = 8 };
 
 struct can_socket {
-    int fd;
-    bool bus_off; /* the controller left the bus; until a frame arrives or it says that it was restarted */
+    struct fl_block *block;
+    const char *interface;
+    struct can_filter filters[CAN_FILTERS];
+    size_t filter_count;
+    struct fl_driver *driver;
+    void (*watch)(struct fl_block *block); /* called by the thread at each look; may be NULL */
+
+    /* Between thread and step. */
+    _Atomic int fd;               /* 0 until the kernel has given a socket */
+    _Atomic bool up;              /* the interface is there and up, and the socket bound to it */
+    _Atomic bool bus_off;         /* the controller left the bus; until a frame arrives, or it says it was restarted */
+    _Atomic uint32_t connections; /* how often the interface came up */
+
+    /* The thread's. */
+    unsigned bound; /* index of the interface; 0: none */
+    int told;       /* the state that the journal has */
 };
 
-/* Open `interface` for frames that pass one of the filters, and for the controller's own reports. FL_OK, or FL_FAILED
- * after fl_fail(). The bus need not be up: it may come and go while the socket stays. */
-int can_open(struct fl_block *block, struct can_socket *can, const char *interface, const struct can_filter *filters,
-             size_t count);
+/* Wait for `interface`, and receive frames that pass one of `filters` (at most CAN_FILTERS, copied), and the
+ * controller's own reports. FL_OK, or FL_FAILED after fl_fail(); that the interface is missing is no failure. */
+int can_start(struct fl_block *block, struct can_socket *can, const char *interface, const struct can_filter *filters,
+              size_t count);
 
-/* The next frame that waits, and when the kernel took it from the bus (CLOCK_MONOTONIC). False: none waits. */
+/* The interface is up: what is sent now goes to the bus. For the step. */
+bool can_connected(const struct can_socket *can);
+
+/* The next frame that waits, and when the kernel took it from the bus (CLOCK_MONOTONIC). False: none waits, or the
+ * interface is down. For the step. */
 bool can_receive(struct can_socket *can, struct can_frame *frame, int64_t *arrived_ns);
 
-/* Hand a frame to the controller's queue. False: the queue is full, or the interface is down. */
-bool can_send(const struct can_socket *can, const struct can_frame *frame);
+/* Hand a frame to the controller's queue. False: the queue is full, or the interface is missing or down. For the step,
+ * and for `safe`. */
+bool can_send(struct can_socket *can, const struct can_frame *frame);
 
-/* After a start that failed halfway too: a descriptor of 0 was never opened, for a state begins as zeros. */
-void can_close(struct can_socket *can);
+/* Stop the thread and close the socket; after a start that failed halfway, or none, too. */
+void can_stop(struct can_socket *can);
 
 #endif

@@ -6,7 +6,7 @@
 #include <math.h>
 #include <stdlib.h>
 
-enum { NODE = 5, PERIOD_MS = 10 };
+enum { NODE = 5, PERIOD_MS = 10, CONTACT = 80 /* periods in which a drive is configured and enabled */ };
 #define MS INT64_C(1000000)
 
 /* --- a drive that does as it is told --- */
@@ -142,6 +142,7 @@ static void take(struct stub *stub, const struct can_frame *frame)
 static void period(struct stub *stub)
 {
     stub->now_ns += PERIOD_MS * MS;
+    stub->command.sync = true;
     stub->sent_count = epos2_advance(&stub->engine, stub->now_ns, &stub->command, stub->sent);
     assert_true(stub->sent_count <= EPOS2_FRAMES);
     if (!stub->present)
@@ -169,7 +170,7 @@ static struct stub *enabled(struct epos2_settings settings)
 {
     struct stub *stub = make(settings);
     stub->command = (struct epos2_command){.enable = true};
-    periods(stub, 60);
+    periods(stub, CONTACT);
     assert_true(epos2_enabled(&stub->engine));
     stub->word_count = 0;
     return stub;
@@ -183,7 +184,7 @@ static void finds_its_way_into_operation(void **state)
     struct stub *stub = make(usual);
     stub->command = (struct epos2_command){.enable = true, .target = -3.2};
     period(stub);
-    assert_int_equal(stub->sent_count, 2); /* our heartbeat, and NMT reset communication */
+    assert_int_equal(stub->sent_count, 3); /* our heartbeat, NMT reset communication, and SYNC for other drives */
     assert_int_equal(stub->sent[0].can_id, 0x77F);
     assert_int_equal(stub->sent[0].data[0], 5);
     assert_int_equal(stub->sent[1].can_id, 0);
@@ -193,12 +194,17 @@ static void finds_its_way_into_operation(void **state)
     assert_memory_equal(stub->sent[0].data, "\x2B\x40\x60\x00\x00\x00\x00\x00", 8);
     period(stub);
     assert_memory_equal(stub->sent[0].data, "\x2F\x60\x60\x00\xFE\x00\x00\x00", 8); /* 6060 = -2 */
-    periods(stub, 60);
+    periods(stub, CONTACT);
     assert_true(epos2_enabled(&stub->engine));
     const uint16_t way[] = {0x0006, 0x0007, 0x000F};
     assert_int_equal(stub->word_count, 3);
     assert_memory_equal(stub->words, way, sizeof way);
     assert_int_equal(stub->target, -32); /* rpm */
+    assert_int_equal(*object(stub, 0x140001), 0x205);
+    assert_int_equal(*object(stub, 0x160001), 0x60400010);
+    assert_int_equal(*object(stub, 0x140101), 0x80000305); /* not used, so off */
+    assert_int_equal(*object(stub, 0x140201), 0x80000405);
+    assert_int_equal(*object(stub, 0x180001), 0xC0000185);
     /* As shipped these are off, by bit 31. */
     assert_int_equal(*object(stub, 0x180101), 0x40000285);
     assert_int_equal(*object(stub, 0x180201), 0x40000385);
@@ -287,7 +293,7 @@ static void writes_targets_of_each_mode(void **state)
         settings.limit_ma = 2000;
         struct stub *stub = make(settings);
         stub->command = (struct epos2_command){.enable = true, .target = cases[i].target};
-        periods(stub, 60);
+        periods(stub, CONTACT);
         assert_true(epos2_enabled(&stub->engine));
         assert_int_equal((uint8_t)stub->mode, cases[i].mode_6060);
         const struct can_frame *last = &stub->sent[stub->sent_count - 2];
@@ -472,26 +478,166 @@ static void a_lost_drive_is_begun_anew(void **state)
     stub->present = true;
     stub->status = 0x0040;
     stub->operational = false;
-    periods(stub, 160);
-    assert_true(epos2_enabled(&stub->engine));
-    hear(stub, 0x700 + NODE, 1, "\x00"); /* it lost its power for a moment */
-    assert_int_equal(stub->engine.phase, EPOS2_CONFIGURING);
-    stub->operational = false;
-    stub->status = 0x0040;
-    periods(stub, 60);
-    assert_true(epos2_enabled(&stub->engine));
+    periods(stub, 100 + CONTACT);
+    assert_int_equal(stub->engine.phase, EPOS2_RUNNING);
+    assert_true(stub->operational);
     test_free(stub);
 }
 
-/* Another master may stop it by NMT. */
-static void a_stopped_node_is_started(void **state)
+/* --- how a drive that works stops to --- */
+
+static void is_silent(struct stub *stub)
+{
+    stub->present = false;
+    periods(stub, 300);
+    stub->present = true;
+    stub->status = 0x0040;
+    stub->operational = false;
+}
+
+static void loses_its_power(struct stub *stub)
+{
+    hear(stub, 0x700 + NODE, 1, "\x00");
+    assert_int_equal(stub->engine.phase, EPOS2_CONFIGURING);
+    stub->operational = false;
+    stub->status = 0x0040;
+}
+
+static void is_stopped_by_another_master(struct stub *stub)
+{
+    stub->operational = false;
+    stub->status = 0x0040;
+}
+
+static void leaves_operation(struct stub *stub)
+{
+    stub->status = 0x0040;
+}
+
+static void is_cut_off(struct stub *stub)
+{
+    epos2_lose(&stub->engine);
+}
+
+static void has_a_fault(struct stub *stub)
+{
+    stub->status = 0x0008;
+    hear(stub, 0x080 + NODE, 8, "\x30\x81\x11\x00\x00\x00\x00\x00"); /* it missed our heartbeats */
+}
+
+static void (*const failures[])(struct stub *stub) = {
+    is_silent, loses_its_power, is_stopped_by_another_master, leaves_operation, is_cut_off, has_a_fault,
+};
+enum { FAILURES = sizeof failures / sizeof failures[0], LONG = 400 };
+
+static void a_motor_that_stopped_waits_for_enable(void **state)
 {
     (void)state;
-    struct stub *stub = enabled(usual);
+    struct epos2_settings settings = usual;
+    settings.automatic_reset = true; /* which takes the fault away, and no more */
+    for (size_t i = 0; i < FAILURES; i++) {
+        struct stub *stub = enabled(settings);
+        failures[i](stub);
+        periods(stub, 5); /* it becomes known */
+        stub->word_count = 0;
+        periods(stub, LONG);
+        assert_true(stub->operational);
+        assert_int_equal(stub->engine.phase, EPOS2_RUNNING);
+        assert_int_equal(stub->status, 0x0040);
+        for (size_t word = 0; word < stub->word_count; word++)
+            assert_false(stub->words[word] & 0x0005); /* nothing on the way up, which begins with shutdown, 6 */
+        stub->command.target = NAN;                   /* a command that is missing for a while is no new decision */
+        periods(stub, 5);
+        stub->command.target = 0;
+        periods(stub, 5);
+        assert_int_equal(stub->status, 0x0040);
+        stub->command.enable = false;
+        periods(stub, 5);
+        assert_int_equal(stub->status, 0x0040);
+        stub->command.enable = true;
+        periods(stub, 10);
+        assert_true(epos2_enabled(&stub->engine));
+        test_free(stub);
+    }
+}
+
+static void a_motor_that_stopped_restarts_where_that_is_wanted(void **state)
+{
+    (void)state;
+    struct epos2_settings settings = usual;
+    settings.automatic_reset = settings.automatic_restart = true;
+    for (size_t i = 0; i < FAILURES; i++) {
+        struct stub *stub = enabled(settings);
+        failures[i](stub);
+        periods(stub, LONG);
+        assert_true(epos2_enabled(&stub->engine));
+        test_free(stub);
+    }
+}
+
+/* Nobody who switches it on while its power is off expects it to start with the power. */
+static void enable_is_for_a_drive_that_is_there(void **state)
+{
+    (void)state;
+    struct stub *stub = make(usual);
+    stub->present = false;
+    stub->command.enable = true;
+    periods(stub, 300);
+    stub->present = true;
+    periods(stub, LONG);
+    assert_true(epos2_enabled(&stub->engine)); /* the first time it may be later than the task */
+    stub->present = false;
+    periods(stub, 300);
+    stub->command.enable = false;
+    periods(stub, 5);
+    stub->command.enable = true;
+    periods(stub, 5);
+    stub->present = true;
     stub->operational = false;
-    periods(stub, 3);
-    assert_true(stub->operational);
-    assert_true(epos2_enabled(&stub->engine));
+    stub->status = 0x0040;
+    periods(stub, LONG);
+    assert_int_equal(stub->engine.phase, EPOS2_RUNNING);
+    assert_int_equal(stub->status, 0x0040);
+    test_free(stub);
+}
+
+static void names_the_first_cause(void **state)
+{
+    (void)state;
+    struct epos2_settings settings = usual;
+    settings.automatic_restart = true;
+    struct stub *stub = make(settings);
+    const struct epos2_trouble *trouble = &stub->engine.trouble;
+    stub->command.enable = true;
+    stub->present = false;
+    periods(stub, 50);
+    assert_int_equal(trouble->cause, EPOS2_FINE); /* it has another half a second */
+    periods(stub, 100);
+    assert_int_equal(trouble->cause, EPOS2_NO_ANSWER);
+    stub->present = true;
+    periods(stub, LONG);
+    assert_int_equal(trouble->cause, EPOS2_FINE);
+    stub->present = false;
+    periods(stub, 500);
+    assert_int_equal(trouble->cause, EPOS2_NO_HEARTBEAT);
+    stub->present = true;
+    stub->refuse = 0x160302;
+    periods(stub, LONG);
+    assert_int_equal(trouble->cause, EPOS2_ABORTED);
+    assert_int_equal(trouble->index, 0x1603);
+    assert_int_equal(trouble->sub, 2);
+    assert_int_equal(trouble->code, 0x06020000);
+    stub->refuse = 0;
+    periods(stub, LONG);
+    assert_int_equal(trouble->cause, EPOS2_FINE);
+    faults(stub);
+    assert_int_equal(trouble->cause, EPOS2_EMERGENCY);
+    assert_int_equal(trouble->code, 0x2310);
+    stub->command.enable = false;
+    periods(stub, 5);
+    stub->command.enable = true;
+    periods(stub, 5);
+    assert_int_equal(trouble->cause, EPOS2_FINE);
     test_free(stub);
 }
 
@@ -556,14 +702,19 @@ static void disables_at_once(void **state)
     (void)state;
     struct can_frame out[EPOS2_FRAMES];
     struct stub *stub = enabled(usual);
-    assert_int_equal(epos2_disable(&stub->engine, out), 1);
-    assert_int_equal(out[0].can_id, 0x205);
-    assert_int_equal(out[0].len, 2);
+    assert_int_equal(epos2_disable(&stub->engine, out), 3);
+    assert_int_equal(out[0].can_id, 0x505); /* the PDO of the commands */
+    assert_int_equal(out[0].len, 6);
     assert_memory_equal(out[0].data, "\0\0", 2);
-    assert_int_equal(epos2_farewell(&stub->engine, out), 2);
-    assert_int_equal(out[0].can_id, 0x205);
-    assert_int_equal(out[1].can_id, 0);
-    assert_memory_equal(out[1].data, "\x82\x05", 2);
+    assert_int_equal(out[1].can_id, 0x205);
+    assert_int_equal(out[1].len, 2);
+    assert_memory_equal(out[1].data, "\0\0", 2);
+    assert_int_equal(out[2].can_id, 0x605); /* an SDO */
+    assert_memory_equal(out[2].data, "\x2B\x40\x60\0\0\0\0\0", 8);
+    assert_int_equal(epos2_farewell(&stub->engine, out), 4);
+    assert_int_equal(out[0].can_id, 0x505);
+    assert_int_equal(out[3].can_id, 0);
+    assert_memory_equal(out[3].data, "\x82\x05", 2);
     test_free(stub);
 }
 
@@ -600,7 +751,7 @@ static void survives_any_frames(void **state)
     struct epos2 engine;
     struct epos2_settings settings = usual;
     settings.mode = EPOS2_PROFILE_POSITION;
-    settings.automatic_reset = true;
+    settings.automatic_reset = settings.automatic_restart = true;
     epos2_begin(&engine, &settings);
     srand(20);
     size_t operated = 0;
@@ -620,7 +771,7 @@ static void survives_any_frames(void **state)
         frame.can_id = (canid_t)(rand() % 64 ? bases[which] + NODE : rand());
         frame.len = (uint8_t)(rand() % 64 ? lengths[which] : rand() % 9);
         epos2_receive(&engine, &frame, now_ns);
-        const struct epos2_command command = {rand() % 8, rand() % 8 ? (double)rand() : (double)NAN};
+        const struct epos2_command command = {rand() % 8, rand() % 2, rand() % 8 ? (double)rand() : (double)NAN};
         size_t count = epos2_advance(&engine, now_ns, &command, out);
         assert_true(count <= EPOS2_FRAMES);
         for (size_t i = 0; i < count; i++) {
@@ -651,7 +802,10 @@ int main(void)
         cmocka_unit_test(stops_before_it_takes_the_power),
         cmocka_unit_test(resumes_from_a_quick_stop),
         cmocka_unit_test(a_lost_drive_is_begun_anew),
-        cmocka_unit_test(a_stopped_node_is_started),
+        cmocka_unit_test(a_motor_that_stopped_waits_for_enable),
+        cmocka_unit_test(a_motor_that_stopped_restarts_where_that_is_wanted),
+        cmocka_unit_test(enable_is_for_a_drive_that_is_there),
+        cmocka_unit_test(names_the_first_cause),
         cmocka_unit_test(sends_heartbeats),
         cmocka_unit_test(offers_positions_by_edges),
         cmocka_unit_test(disables_at_once),

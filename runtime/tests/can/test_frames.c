@@ -6,6 +6,7 @@
 
 #include <flotilla/block.h>
 #include <linux/can/error.h>
+#include <sched.h>
 
 static struct can_frame frame_of(canid_t id, uint8_t length, const char *data)
 {
@@ -212,12 +213,115 @@ static void refuses(void **state)
         strstr(testbed_refusal("can-send", "id", "1", "length", "1", "reset", "0", NULL), "is not 1 bytes"));
 }
 
-static void needs_its_interface(void **state)
+/* Until a step makes the flag so, with a new frame for each. What is awaited is the thread's: it looks ten times a
+ * second. */
+static void step_until(struct fl_block *block, bool flag)
+{
+    const int64_t patience_ns = INT64_C(30000000000);
+    for (int64_t from_ns = fl_now_ns(); GET(block, "flag", bool) != flag;) {
+        assert_true(fl_now_ns() - from_ns < patience_ns);
+        put(5, 1, "a");
+        assert_int_equal(testbed_step(block), FL_OK);
+        block->release_ns = fl_now_ns();
+        sched_yield();
+    }
+}
+
+static void sends_when_the_interface_comes(void **state)
 {
     (void)state;
+    struct can_frame frame;
     hub_open();
-    struct fl_block *block = testbed_block("can-receive", "id", "1", "interface", "can9", NULL);
-    assert_int_equal(block->type->start(block), FL_FAILED);
+    hub_link("");
+    struct fl_block *block = testbed_block("can-send", "id", "5", "length", "1", NULL);
+    testbed_begin(block);
+    for (int i = 0; i < 3; i++)
+        assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", bool), 0);
+    assert_int_equal(GET(block, "sent", uint32_t), 0);
+    block->type->safe(block);
+    hub_link("7 down");
+    hub_await();
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", bool), 0);
+    hub_link("7 up");
+    step_until(block, 1);
+    assert_true(hub_take(&frame));
+    assert_int_equal(frame.can_id, 5);
+    testbed_end(block);
+    hub_close();
+}
+
+static void receives_again_after_unplugging(void **state)
+{
+    (void)state;
+    static const char *const gone[] = {"", "7 down", ""}, *const back[] = {"7 up", "7 up", "8 up"};
+    struct can_frame none;
+    hub_open();
+    hub_link("");
+    struct fl_block *block = testbed_block("can-receive", "id", "5", "timeout", "3600", NULL);
+    testbed_begin(block);
+    for (size_t i = 0; i < 3; i++) {
+        hub_link(gone[i]);
+        assert_int_equal(testbed_step(block), FL_OK);
+        assert_int_equal(GET(block, "flag", bool), 0); /* however new the last frame is */
+        hub_link(back[i]);
+        if (i != 1)
+            hub_await();
+        assert_false(hub_take(&none));
+        step_until(block, 1);
+    }
+    testbed_end(block);
+    hub_close();
+}
+
+static void bus_off_ends_with_the_interface(void **state)
+{
+    (void)state;
+    struct can_frame frame;
+    hub_open();
+    hub_link("7 up");
+    struct fl_block *block = testbed_block("can-send", "id", "5", "length", "1", NULL);
+    testbed_begin(block);
+    step_until(block, 1);
+    assert_true(hub_take(&frame));
+    put(CAN_ERR_FLAG | CAN_ERR_BUSOFF, 8, "\0\0\0\0\0\0\0\0");
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_int_equal(GET(block, "flag", bool), 0);
+    hub_link("7 down");
+    assert_int_equal(testbed_step(block), FL_OK);
+    hub_link("7 up");
+    step_until(block, 1);
+    testbed_end(block);
+    hub_close();
+}
+
+/* Unplugged and plugged in: the drive is begun anew, by a reset of its communication. */
+static void a_drive_is_begun_anew_with_its_interface(void **state)
+{
+    (void)state;
+    struct can_frame frame;
+    hub_open();
+    hub_link("");
+    struct fl_block *block = testbed_block("epos2", "node", "5", "mode", "velocity", NULL);
+    testbed_begin(block);
+    for (unsigned index = 7; index < 10; index++) {
+        char up[16];
+        snprintf(up, sizeof up, "%u up", index);
+        assert_int_equal(testbed_step(block), FL_OK);
+        while (hub_take(&frame))
+            ;
+        hub_link(up);
+        hub_await();
+        do { /* it sends from the step on in which it is known to be up */
+            assert_int_equal(testbed_step(block), FL_OK);
+        } while (!hub_take(&frame));
+        if (frame.can_id != 0)
+            assert_true(hub_take(&frame));
+        assert_int_equal(frame.can_id, 0);
+        assert_memory_equal(frame.data, "\x82\x05", 2);
+        hub_link("");
+    }
     testbed_end(block);
     hub_close();
 }
@@ -233,16 +337,73 @@ static void a_drive_is_disabled_by_safe_and_at_the_end(void **state)
     while (hub_take(&frame))
         ;
     block->type->safe(block);
-    assert_true(hub_take(&frame));
-    assert_int_equal(frame.can_id, 0x205);
-    assert_memory_equal(frame.data, "\0\0", 2);
+    const canid_t ways[] = {0x505, 0x205, 0x605};
+    for (size_t i = 0; i < 3; i++) {
+        assert_true(hub_take(&frame));
+        assert_int_equal(frame.can_id, ways[i]);
+    }
     assert_false(hub_take(&frame));
     testbed_end(block);
-    assert_true(hub_take(&frame));
-    assert_int_equal(frame.can_id, 0x205);
+    for (size_t i = 0; i < 3; i++) {
+        assert_true(hub_take(&frame));
+        assert_int_equal(frame.can_id, ways[i]);
+    }
     assert_true(hub_take(&frame));
     assert_int_equal(frame.can_id, 0);
     assert_memory_equal(frame.data, "\x82\x05", 2);
+    hub_close();
+}
+
+static unsigned syncs(void)
+{
+    struct can_frame frame;
+    unsigned count = 0;
+    while (hub_take(&frame))
+        count += frame.can_id == 0x080;
+    return count;
+}
+
+/* On one bus, here in one process as well as elsewhere: only the kernel knows of the claim. */
+static void one_block_sends_sync(void **state)
+{
+    (void)state;
+    enum { DRIVES = 4, STEPS = 10 };
+    struct fl_block *drives[DRIVES];
+    char node[4], master[4];
+    hub_open();
+    for (int i = 0; i < DRIVES; i++) {
+        snprintf(node, sizeof node, "%d", i + 1);
+        snprintf(master, sizeof master, "%d", 120 + i);
+        drives[i] = testbed_block("epos2", "node", node, "master", master, "mode", "velocity", NULL);
+        testbed_begin(drives[i]);
+    }
+    syncs();
+    for (int step = 0; step < STEPS; step++) {
+        for (int i = 0; i < DRIVES; i++) {
+            assert_int_equal(testbed_step(drives[i]), FL_OK);
+            assert_int_equal(syncs(), i == 0); /* the first that started */
+        }
+    }
+    testbed_end(drives[0]);
+    unsigned sent = 0;
+    for (int64_t from_ns = fl_now_ns(); !sent; sent = syncs()) { /* then one of the others takes over */
+        assert_true(fl_now_ns() - from_ns < INT64_C(30000000000));
+        for (int i = 1; i < DRIVES; i++)
+            assert_int_equal(testbed_step(drives[i]), FL_OK);
+    }
+    for (int step = 0; step < STEPS; step++) {
+        for (int i = 1; i < DRIVES; i++)
+            assert_int_equal(testbed_step(drives[i]), FL_OK);
+        assert_int_equal(syncs(), 1);
+    }
+    struct fl_block *silent = testbed_block("epos2", "node", "9", "mode", "velocity", "sync", "none", NULL);
+    for (int i = 1; i < DRIVES; i++)
+        testbed_end(drives[i]);
+    testbed_begin(silent);
+    for (int step = 0; step < STEPS; step++)
+        assert_int_equal(testbed_step(silent), FL_OK);
+    assert_int_equal(syncs(), 0);
+    testbed_end(silent);
     hub_close();
 }
 
@@ -266,11 +427,20 @@ static void steps_never_block(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(receives_the_newest), cmocka_unit_test(ages_from_the_kernels_stamp),
-        cmocka_unit_test(goes_bad_with_age),   cmocka_unit_test(filters),
-        cmocka_unit_test(bus_off_is_no_good),  cmocka_unit_test(sends),
-        cmocka_unit_test(resets_what_is_old),  cmocka_unit_test(refuses),
-        cmocka_unit_test(needs_its_interface), cmocka_unit_test(a_drive_is_disabled_by_safe_and_at_the_end),
+        cmocka_unit_test(receives_the_newest),
+        cmocka_unit_test(ages_from_the_kernels_stamp),
+        cmocka_unit_test(goes_bad_with_age),
+        cmocka_unit_test(filters),
+        cmocka_unit_test(bus_off_is_no_good),
+        cmocka_unit_test(sends),
+        cmocka_unit_test(resets_what_is_old),
+        cmocka_unit_test(refuses),
+        cmocka_unit_test(sends_when_the_interface_comes),
+        cmocka_unit_test(receives_again_after_unplugging),
+        cmocka_unit_test(bus_off_ends_with_the_interface),
+        cmocka_unit_test(a_drive_is_begun_anew_with_its_interface),
+        cmocka_unit_test(a_drive_is_disabled_by_safe_and_at_the_end),
+        cmocka_unit_test(one_block_sends_sync),
         cmocka_unit_test(steps_never_block),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

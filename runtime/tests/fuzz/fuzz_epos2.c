@@ -26,12 +26,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
                                             .heartbeat_ms = 100,
                                             .counts_per_rad = 318.3,
                                             .rpm_per_rad_s = 9.55,
-                                            .automatic_reset = true};
+                                            .automatic_reset = true,
+                                            .automatic_restart = true};
     struct epos2 drive;
     int64_t now_ns = 0;
     epos2_begin(&drive, &settings);
     for (; size >= RECORD; data += RECORD, size -= RECORD, now_ns += PERIOD_NS) {
-        const struct epos2_command command = {.enable = data[1] < 0xF0, .target = (int8_t)data[2] * 1e3};
+        const struct epos2_command command = {.enable = data[1] < 0xF0, .sync = true, .target = (int8_t)data[2] * 1e3};
         struct can_frame frame = {.can_id = senders[data[0] % 8] + NODE}, out[EPOS2_FRAMES];
         frame.len = data[1] % 9;
         memcpy(frame.data, data + 2, 8);
