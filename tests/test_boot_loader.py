@@ -239,6 +239,19 @@ def test_sectors_that_cannot_be_read(board: Board, partition: BootPartition, tmp
             assert "failure reading sector" in started.said, f"{path} was read:\n{started.said}"
 
 
+def test_a_kernel_without_an_initramfs(board: Board, partition: BootPartition, toolset: Tools, tmp_path: Path) -> None:
+    """As our own is: the board's other configuration, and a board without a watchdog."""
+    place = partition.place(ENV)
+    none = partition.changed("rm /A/initrd.img", "rm /B/initrd.img")
+    for each in (board, board.model_copy(update={"watchdog": None})):
+        core = card.grub_core(each, toolset, tmp_path, card.grub_config(each, initramfs=False))
+        with BootLoader(board, partition, tmp_path / str(bool(each.watchdog)), head=partition.with_core(core)) as other:
+            for content in (block(), block("B A"), bytes(SIZE), block("B A", "13", "13")):
+                started = check(other, repr(content[:70]), {**none, place: content})
+                assert started.slot == ("B" if content[:35].endswith(b"ORDER=B A\n") else "A")
+            assert ("flotilla.watchdog_stop=1089:0" in started.arguments) == bool(each.watchdog)
+
+
 def test_the_watchdog_runs_before_the_kernel_does(
     board: Board, loader: BootLoader, partition: BootPartition, toolset: Tools, tmp_path: Path
 ) -> None:
