@@ -64,7 +64,19 @@ def build(fleet: Fleet, robots: list[Robot], directory: Path = paths.IMAGES) -> 
         for robot in robots:
             if robot.board not in boards:
                 boards[robot.board] = board_build(fleet.boards[robot.board])
-        return [_robot_image(fleet, robot, boards[robot.board], directory) for robot in robots]
+        images = [_robot_image(fleet, robot, boards[robot.board], directory) for robot in robots]
+        for made in boards.values():
+            if missing := made.lock.missing_suites:
+                print(missing_suites(made.lock.name, missing))
+        return images
+
+
+def missing_suites(board: str, missing: tuple[str, ...]) -> str:
+    """What a build says of a board whose lock was made without some suites: it does not go unnoticed."""
+    return (
+        f"{board}: its packages are locked without {', '.join(missing)}, whose updates they lack; "
+        "`make lock` takes them in as soon as the mirror has what is signed"
+    )
 
 
 def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
@@ -86,7 +98,8 @@ def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) 
     final = image_of(robot, directory)
     work = directory / f".{robot.name}.part"
     cache.discard(work)
-    work.mkdir(parents=True)
+    directory.mkdir(parents=True, exist_ok=True)
+    work.mkdir(0o700)  # private keys are in what is made here
     new = work / final.name
     try:
         with ThreadPoolExecutor() as threads:

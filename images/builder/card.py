@@ -6,8 +6,8 @@ adds a robot's data.
 | bytes from the start | what |
 |---|---|
 | 0 | MBR: GRUB's boot.img, disk identifier, partition table |
-| 512 | GRUB's core image, with every module it needs |
-| 1 MiB | boot (ext2): grub.cfg, environment block, kernel and initramfs of each slot |
+| 512 | GRUB's core image, with every module it needs, and its configuration |
+| 1 MiB | boot (ext2): environment block, kernel and initramfs of each slot |
 | 49 MiB | slot A (squashfs) |
 | 209 MiB | slot B (empty until the first update) |
 | 369 MiB | data (ext4): the robot's identity, then all that changes; grows to the card on first boot |
@@ -15,9 +15,11 @@ adds a robot's data.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import struct
+import tarfile
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -30,7 +32,11 @@ from images.builder.tools import Tools
 MIB = 1 << 20
 DISK_ID = 0x464C4F54
 """MBR identifier of every card. One per card is in a robot, so it needs no more to be found by."""
-_GRUB_MODULES = "biosdisk part_msdos ext2 linux normal configfile loadenv test echo serial terminal sleep reboot"
+_GRUB_MODULES = """
+    biosdisk part_msdos ext2 memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot
+    iorw
+"""
+_GRUB_TEMPLATE = paths.PROJECT / "images" / "grub.cfg.j2"
 _UUIDS = {"boot": "5b0e4a3c-6f1d-4c58-9d0a-000000000001", "data": "5b0e4a3c-6f1d-4c58-9d0a-000000000004"}
 
 
@@ -58,6 +64,9 @@ COMMON_ARGUMENTS = ["ro", "rootfstype=squashfs", "init=/usr/lib/flotilla/preinit
 """Kernel command line of every card; the board adds its own. The kernel's self-tests of its ciphers take two seconds of
 each boot under emulation, and more on the board; to look for ISA cards without jumpers, a third of one."""
 
+ENVIRONMENT_BLOCK = b"# GRUB Environment Block\nORDER=A B\nA_OK=1\nA_TRY=0\nB_OK=0\nB_TRY=0\n".ljust(1024, b"#")
+"""What GRUB and the running system tell each other about the slots, as on a new card: A is good, B is empty."""
+
 Extents = list[tuple[int, int]]
 """Byte ranges (offset, length) of a card that hold anything."""
 
@@ -65,14 +74,15 @@ Extents = list[tuple[int, int]]
 def kernel_arguments(board: Board) -> list[str]:
     """The command line, but for what GRUB adds for the slot."""
     console = f"console={board.console.tty},{board.console.baud}n8"
-    return [*COMMON_ARGUMENTS, *board.kernel_arguments, "console=tty0", console]
+    stop = board.watchdog and board.watchdog.stop
+    own = [f"flotilla.watchdog_stop={stop.port}:{stop.value:o}"] if stop else []  # for preinit
+    return [*COMMON_ARGUMENTS, *board.kernel_arguments, *own, "console=tty0", console]
 
 
 def base(board: Board, root: Path, tools: Tools, epoch: int) -> Path:
     """Directory with `card.img`, everything but the data partition, and `extents.json`."""
-    template = paths.PROJECT / "images" / "grub.cfg.j2"
     key = cache.digest(
-        root.name, tools.directory.name, str(epoch), board.model_dump_json(), template, Path(__file__),
+        root.name, tools.directory.name, str(epoch), board.model_dump_json(), _GRUB_TEMPLATE, Path(__file__),
         Path(filesystem.__file__),
     )  # fmt: skip
 
@@ -84,11 +94,13 @@ def base(board: Board, root: Path, tools: Tools, epoch: int) -> Path:
                 "leave out packages in images/packages/ or files in images/rootfs/exclude.list"
             )
         boot = out / "boot.img"
+        kernel = [root / name for name in ("vmlinuz", "initrd.img") if (root / name).exists()]
+        config = grub_config(board, initramfs=len(kernel) > 1)
         boot_extents = filesystem.make(
-            tools, boot, BOOT.size, _boot_nodes(board, root, template), kind="ext2", label="boot", uuid=_UUIDS["boot"],
+            tools, boot, BOOT.size, _boot_nodes(kernel), kind="ext2", label="boot", uuid=_UUIDS["boot"],
             epoch=epoch,
         )  # fmt: skip
-        core = _core(tools, out)
+        core = grub_core(board, tools, out, config)
         with (out / "card.img").open("wb") as card:
             card.truncate(SIZE)
             card.write(_boot_sector(tools))
@@ -109,9 +121,14 @@ def extents(base_directory: Path) -> Extents:
 
 
 def begin(base_directory: Path, out: Path) -> Extents:
-    """Write the card `out` up to the robot's data partition. Only what holds anything is written."""
+    """Write the card `out` up to the robot's data partition. Only what holds anything is written.
+
+    It is for its owner alone: the data partition holds the robot's private key.
+    """
     whole = Partition(0, "card", 0, SIZE)
-    with out.open("wb") as card:
+    out.unlink(missing_ok=True)
+    out.touch(0o600, exist_ok=False)
+    with out.open("r+b") as card:
         card.truncate(SIZE)
         return _place(base_directory / "card.img", extents(base_directory), card.fileno(), whole)
 
@@ -140,7 +157,8 @@ def _place(source: Path, extents: Extents, card: int, partition: Partition) -> E
     return [(partition.start + start, length) for start, length in extents]
 
 
-def _boot_nodes(board: Board, root: Path, template: Path) -> list[Node]:
+def grub_config(board: Board, *, initramfs: bool) -> bytes:
+    """What GRUB does on a card of the board."""
     import jinja2  # here, because the next robot's card does not need it
 
     environment = jinja2.Environment(
@@ -150,39 +168,44 @@ def _boot_nodes(board: Board, root: Path, template: Path) -> list[Node]:
         keep_trailing_newline=True,
         autoescape=False,
     )
-    files = [root / name for name in ("vmlinuz", "initrd.img") if (root / name).exists()]
-    config = environment.from_string(template.read_text()).render(
-        board=board, slots=SLOTS, kernel_arguments=kernel_arguments(board), initramfs=len(files) > 1
+    text: str = environment.from_string(_GRUB_TEMPLATE.read_text()).render(
+        board=board, slots=SLOTS, kernel_arguments=kernel_arguments(board), initramfs=initramfs
     )
-    variables = "# GRUB Environment Block\nORDER=A B\nA_OK=1\nA_TRY=0\nB_OK=0\nB_TRY=0\n"
+    return text.encode()
+
+
+def _boot_nodes(kernel: list[Path]) -> list[Node]:
     return [
         Node(PurePosixPath("/grub")),
-        Node(PurePosixPath("/grub/grub.cfg"), config.encode(), 0o644),
-        Node(PurePosixPath("/grub/grubenv"), variables.encode().ljust(1024, b"#"), 0o644),
+        Node(PurePosixPath("/grub/grubenv"), ENVIRONMENT_BLOCK, 0o644),
         Node(PurePosixPath("/A")),
-        *(Node(PurePosixPath("/A") / file.name, file.read_bytes(), 0o644) for file in files),
+        *(Node(PurePosixPath("/A") / file.name, file.read_bytes(), 0o644) for file in kernel),
         Node(PurePosixPath("/B")),
     ]
 
 
-def _core(tools: Tools, out: Path) -> bytes:
-    """GRUB's core image; it reads its configuration from the boot partition of the disk it came from."""
-    core = out / "core.img"
+def grub_core(board: Board, tools: Tools, out: Path, config: bytes) -> bytes:
+    """GRUB's core image, made in the directory `out`. It starts the watchdog before it reads anything.
+
+    The configuration is inside it: where it lies, nothing is ever written, and GRUB stands still on some damaged ones.
+    """
+    core, begin, inside = out / "core.img", out / "begin.cfg", out / "memdisk.tar"
+    start = board.watchdog and board.watchdog.start
+    lines = [f"outb {start.port} {start.value}"] if start else []
+    begin.write_text("".join(f"{line}\n" for line in [*lines, "configfile (memdisk)/grub.cfg"]))
+    with tarfile.open(inside, "w", format=tarfile.USTAR_FORMAT) as archive:
+        member = tarfile.TarInfo("grub.cfg")
+        member.size = len(config)
+        archive.addfile(member, io.BytesIO(config))
     modules = tools.directory / "usr/lib/grub/i386-pc"
     tools.run(
-        "usr/bin/grub-mkimage",
-        "-O",
-        "i386-pc",
-        "-d",
-        modules,
-        "-p",
-        "(,msdos1)/grub",
-        "-o",
-        core,
-        *_GRUB_MODULES.split(),
-    )
+        "usr/bin/grub-mkimage", "-O", "i386-pc", "-d", modules, "-c", begin,
+        "-m", inside, "-p", "(,msdos1)/grub",  # in this order: a memdisk moves the prefix into itself
+        "-o", core, *_GRUB_MODULES.split(),
+    )  # fmt: skip
     content = core.read_bytes()
-    core.unlink()
+    for file in (core, begin, inside):
+        file.unlink()
     if len(content) > BOOT.start - 512:
         raise UserError(f"GRUB's core image of {len(content)} bytes does not fit before the first partition")
     return content

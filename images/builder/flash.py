@@ -405,12 +405,13 @@ def _open_file(file: Path, image: Path, size: int) -> Target:
     if file.exists() and file.samefile(image):
         raise UserError(f"{file}: that is the image itself; give another file")
     try:
-        target = Target(file, os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666))
+        target = Target(file, os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
     except OSError as error:
         raise UserError(f"{file}: cannot be opened, {error.strerror}; choose another place") from error
     try:
         # QEMU locks the disks it runs from.
         fcntl.lockf(target.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.fchmod(target.descriptor, 0o600)  # the image holds a private key
         if os.fstat(target.descriptor).st_size < size:
             os.ftruncate(target.descriptor, size)
     except OSError as error:

@@ -19,6 +19,9 @@ from images.builder.errors import UserError
 BAUDS = (300, 600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 """Rates of termios(3) that serial devices use. A plain 16550A ends at 115200."""
 
+CAN_BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+"""Bits per second of CANopen (CiA 301, 5.2), which other devices on CAN use, too."""
+
 CHANNELS_MHZ = (
     *range(2412, 2473, 5),  # 802.11b/g channels 1–13
     2484,  # 802.11b channel 14, Japan
@@ -64,6 +67,10 @@ Interface = Annotated[
     _matching(
         r"[a-z][a-z0-9]{0,14}", "is not a network interface's name", "such as eth0 or wlan0, at most 15 characters"
     ),
+]
+CanInterface = Annotated[
+    str,
+    _matching(r"can[0-9]", "is not a CAN interface's name", "can0 to can9, as the kernel names the board's channels"),
 ]
 Label = Annotated[
     str,
@@ -144,6 +151,22 @@ class Console(_Model):
     ]
 
 
+class PortWrite(_Model):
+    """A byte written to an I/O port of the PC."""
+
+    port: Annotated[_Int, _between(0, 0xFFFF)]
+    value: Annotated[_Int, _between(0, 0xFF)]
+
+
+class Watchdog(_Model):
+    """How to reach the hardware watchdog without its driver. Once started it resets the board unless restarted."""
+
+    start: PortWrite
+    """Runs it for as long as it can wait, and starts the wait anew."""
+    stop: PortWrite
+    """Halts it."""
+
+
 class Qemu(_Model):
     """The machine that stands in for the board."""
 
@@ -189,6 +212,8 @@ class Board(_Model):
     """Kernel modules needed to reach the card; they make the initramfs."""
     modules: list[Module] = []
     """Kernel modules of devices that no bus announces, such as an ISA watchdog; loaded on every boot."""
+    watchdog: Watchdog | None = None
+    """The boot loader starts it; the service manager takes it over through its driver, whose source says how."""
     qemu: Qemu
 
     @property
@@ -283,6 +308,18 @@ class Device(_Model):
     baud: Baud
 
 
+class Can(_Model):
+    """A channel of the robot's CAN board; its name is the kernel's, such as `can0`."""
+
+    bitrate: Annotated[
+        _Int,
+        _checked(CAN_BITRATES.__contains__, "is not a standard rate", f"one of {', '.join(map(str, CAN_BITRATES))}"),
+    ]
+    """Bits per second, the same for all on the bus."""
+    restart_ms: Annotated[_Int, _between(1, 60_000, "milliseconds")] = 100
+    """How long after bus-off the controller starts again by itself."""
+
+
 class Host(_Model):
     """A member of the fleet: a robot or the station."""
 
@@ -295,6 +332,8 @@ class Robot(Host):
     board: str
     """Name of the board, a key of `Fleet.boards`."""
     devices: dict[DeviceName, Device] = {}
+    can: dict[CanInterface, Can] = {}
+    """CAN interfaces that are brought up, by the kernel's name. An app may use one that no control task does."""
     control_tasks: list[TaskName] = []
     """Control tasks that start with the robot: `ansible/control_tasks/NAME.yml` each."""
     standby: list[TaskName] = []

@@ -13,7 +13,7 @@ import subprocess
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
-from images.builder import paths
+from images.builder import interfaces, paths
 from images.builder.errors import UserError
 from images.builder.filesystem import Node
 from images.builder.fleet import Fleet, Host, Robot
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 TASKS = PurePosixPath("/etc/flotilla/tasks")
 """Where a robot's control tasks lie on it."""
+_CAN = PurePosixPath("etc/systemd/network/20-can.network.j2")
+"""Rendered for each CAN interface of the robot, with its name in the file's."""
 _PRIVATE = {"ssh_host_ed25519_key.j2": 0o600}
 """Modes of templates whose result is not for everyone."""
 
@@ -149,20 +151,32 @@ def render(fleet: Fleet, robot: Robot) -> dict[PurePosixPath, tuple[bytes, int]]
     values = variables(fleet, robot)
     files = {}
     for template in sorted(paths.OVERLAY.rglob("*.j2")):
-        name = template.relative_to(paths.OVERLAY)
-        try:
-            content = _environment().get_template(str(name)).render(values).encode()
-        except jinja2.TemplateError as error:
-            raise UserError(f"{paths.shown(template)}: {error}") from error
-        if content.strip():
-            files[PurePosixPath("/") / name.with_suffix("")] = (content, _PRIVATE.get(template.name, 0o644))
+        name = PurePosixPath(template.relative_to(paths.OVERLAY))
+        each: dict[PurePosixPath, dict[str, object]] = {name.with_suffix(""): {}}
+        if name == _CAN:
+            each = {_CAN.with_name(f"20-{can}.network"): {"can": can, "bus": bus} for can, bus in robot.can.items()}
+        for path, further in each.items():
+            try:
+                content = _environment().get_template(str(name)).render(values | further).encode()
+            except jinja2.TemplateError as error:
+                raise UserError(f"{paths.shown(template)}: {error}") from error
+            if content.strip():
+                files[PurePosixPath("/") / path] = (content, _PRIVATE.get(template.name, 0o644))
     return files | {TASKS / f"{name}.yml": (task, 0o644) for name, task in control_tasks(fleet, robot).items()}
 
 
 def control_tasks(fleet: Fleet, robot: Robot) -> dict[str, bytes]:
     """The robot's control tasks by name. Without keys: whoever only reads a description pins nothing."""
     values = _description(fleet, robot)
-    return {name: _task(name, values) for name in robot.control_tasks}
+    tasks = {name: _task(name, values) for name in robot.control_tasks}
+    problems = [
+        f"{paths.shown(paths.TASKS / f'{name}.yml')}: {problem}"
+        for name, task in tasks.items()
+        for problem in interfaces.problems(task, fleet, robot)
+    ]
+    if problems:
+        raise UserError("\n".join(problems))
+    return tasks
 
 
 def _task(name: str, values: dict[str, object]) -> bytes:

@@ -40,7 +40,7 @@ Scope = tuple[str, str]
 
 _HOMES = {"fleet_name": "all", "network": "all", "health": "all", "board": "board_*"}
 """Variables that hosts share, and the one group whose `group_vars/` sets them."""
-_OF_ROBOTS = ("number", "devices", "control_tasks", "standby")
+_OF_ROBOTS = ("number", "devices", "can", "control_tasks", "standby")
 _VARIABLES = {"address", *_OF_ROBOTS, *_HOMES}
 """The variables read here. Any others are Ansible's and its roles'."""
 

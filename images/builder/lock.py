@@ -103,6 +103,12 @@ class Lock:
         """When an archive's newest suite was released."""
         return max(suite.date for suite in self.suites if suite.archive == archive)
 
+    @property
+    def missing_suites(self) -> tuple[str, ...]:
+        """Suites that it was made without, as no signature covered what the mirror had of them."""
+        there = {suite.name for suite in self.suites}
+        return tuple(name for _, name in _SUITES if name not in there)
+
     def without(self, role: Role) -> Lock:
         """The lock but for the packages of one role."""
         return dataclasses.replace(self, packages=tuple(each for each in self.packages if each.role != role))

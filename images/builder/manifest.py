@@ -84,6 +84,8 @@ class LockId(_Model):
     name: str
     sha256: str
     suites: list[Suite]
+    missing_suites: list[str] = []
+    """Those that the lock was made without: packages lack what these have, such as security updates."""
 
 
 class Source(_Model):
@@ -245,11 +247,22 @@ def sboms(board: str, lock: Lock, status: str, out: Path) -> None:
         raise UserError(f"debsbom failed (status {done.returncode}): {done.stderr.strip()}")
     for ending in SBOMS:
         made = out / f"made.{ending}"
-        document = _sorted(json.loads(made.read_text(encoding="utf-8")))
+        document = _with_missing_suites(_sorted(json.loads(made.read_text(encoding="utf-8"))), lock)
         text = json.dumps(document, indent=1, ensure_ascii=False, sort_keys=True)
         (out / f"sbom.{ending}").write_text(text + "\n", encoding="utf-8")
         made.unlink()
     shutil.rmtree(root)
+
+
+def _with_missing_suites(document: dict[str, Any], lock: Lock) -> dict[str, Any]:
+    """The bill with the suites that its packages were not updated from, where each format has room for that."""
+    missing = lock.missing_suites
+    if missing and "spdxVersion" in document:
+        document["comment"] = f"The packages were locked without the suites {', '.join(missing)}."
+    elif missing:
+        properties = document["metadata"].setdefault("properties", [])
+        properties += [{"name": "flotilla:missing-suite", "value": name} for name in missing]
+    return document
 
 
 def _sorted(value: Any) -> Any:
@@ -373,7 +386,7 @@ def _git(directory: Path, *arguments: str) -> str:
 
 def _lock_id(lock: Lock) -> LockId:
     suites = [Suite(archive=suite.archive, name=suite.name, released=suite.date) for suite in lock.suites]
-    return LockId(name=lock.name, sha256=lock.digest, suites=suites)
+    return LockId(name=lock.name, sha256=lock.digest, suites=suites, missing_suites=list(lock.missing_suites))
 
 
 def part(name: str, file: Path, start: int, length: int) -> Part:

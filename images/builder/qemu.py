@@ -88,8 +88,9 @@ class Options:
     """Do not run before QMP says `cont`."""
     reboot: bool = True
     """False: QEMU ends where the machine would reboot."""
-    watchdog: Literal["reset", "shutdown", "poweroff", "pause", "none"] = "reset"
-    """What the board's watchdog does when nobody feeds it."""
+    watchdog: Literal["reset", "shutdown", "poweroff", "pause", "none"] = "none"
+    """What the board's watchdog does when nobody feeds it. The boot loader starts it, and it waits for 30 s of the
+    host's time, in which a guest of a busy host is not up: that would be reset for ever."""
     capture: Path | None = None
     """pcap file of everything on the wired port."""
     virtual_time: bool = False
@@ -160,6 +161,7 @@ def make_overlay(image: Path, overlay: Path, size: int = 0) -> None:
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     if done.returncode:
         raise UserError(f"{paths.shown(overlay)}: qemu-img cannot make the overlay: {done.stderr.strip()}")
+    overlay.chmod(0o600)  # what the guest writes may be a private key
 
 
 def chardev(identifier: str, backend: str) -> str:

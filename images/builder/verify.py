@@ -94,6 +94,7 @@ def verify(fleet: Fleet, robot: Robot, *, plant: bool = False) -> str:
         saved = paths.BUILD / f"verify-{robot.name}.img"
         saved.unlink(missing_ok=True)  # of an earlier run
         if found:
+            saved.touch(0o600)  # it holds a private key
             shutil.copyfile(second, saved)
             raise UserError(
                 "\n  ".join([f"{robot.name}: the image built elsewhere differs from {paths.shown(first)}:", *found])

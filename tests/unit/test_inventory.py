@@ -56,10 +56,49 @@ CASES = {
         ROBOTS, "10.42.0.254", "10.42.0.1", "station.address", "is robot1's address…10.42.0.5"
     ),
     "copied without a new name": Case(
-        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 53…another name"
+        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 60…another name"
     ),
     # One robot
     "number 0": Case(ROBOTS, "number: 4", "number: 0", "robot4.number", "out of range…1 to 250"),
+    "CAN interface": Case(
+        ROBOTS,
+        "number: 4",
+        "number: 4\n          can: { vcan0: { bitrate: 500000 } }",
+        "robot4.can.vcan0",
+        "CAN interface's name…can0 to can9",
+    ),
+    "CAN bit rate": Case(
+        ROBOTS,
+        "number: 4",
+        "number: 4\n          can: { can0: { bitrate: 512000 } }",
+        "robot4.can.can0.bitrate",
+        "standard rate…500000, 800000, 1000000",
+    ),
+    "CAN restart": Case(
+        ROBOTS,
+        "number: 4",
+        "number: 4\n          can: { can0: { bitrate: 500000, restart_ms: 0 } }",
+        "robot4.can.can0.restart_ms",
+        "out of range…1 to 60000",
+    ),
+    "CAN interface twice": Case(
+        ROBOTS,
+        "number: 4",
+        "number: 4\n          can:\n            can0: { bitrate: 500000 }\n            can0: { bitrate: 250000 }",
+        "robot4.can.can0",
+        "stands twice…",
+    ),
+    "CAN without rate": Case(
+        ROBOTS,
+        "number: 4",
+        "number: 4\n          can: { can0: {} }",
+        "robot4.can.can0.bitrate",
+        "is missing…",
+        "can0",
+    ),
+    "watchdog's port": Case(
+        PC104, "port: 0x443", "port: 0x10443", "board.watchdog.start.port", "out of range…0 to 65535"
+    ),
     "number 251": Case(ROBOTS, "number: 4", "number: 251", "robot4.number", "out of range…1 to 250"),
     "number in words": Case(ROBOTS, "number: 4", "number: four", "robot4.number", "not a whole number…digits"),
     "number in quotes": Case(ROBOTS, "number: 4", "number: '4'", "robot4.number", "not a whole number…without quotes"),

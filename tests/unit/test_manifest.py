@@ -5,17 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import subprocess
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
+from types import SimpleNamespace
 
 import pytest
 
-from images.builder import card, inventory, manifest
+from images.builder import build, card, inventory, manifest
 from images.builder.errors import UserError
 from images.builder.filesystem import Node
 from images.builder.fleet import Fleet
-from images.builder.lock import Lock, Package, Suite, read_lock
+from images.builder.lock import Lock, Package, Suite, format_lock, parse_lock, read_lock
 
 STATUS = """Package: libone
 Status: install ok installed
@@ -97,6 +99,39 @@ def test_bills_of_materials(tmp_path: Path) -> None:
 
     other = json.loads(sboms(STATUS.replace("Version: 1.2\n", "Version: 1.3\n"), tmp_path / "other")["sbom.cdx.json"])
     assert other["serialNumber"] != cdx["serialNumber"]
+
+
+def test_a_lock_without_a_suite_is_told_everywhere(fleet: Fleet, tmp_path: Path) -> None:
+    """A planted lock: i386's, with and without the suite of security updates."""
+    names = ("bookworm", "bookworm-updates", "bookworm-security")
+    suites = [Suite("debian-security" if "sec" in name else "debian", name, LOCK.suites[0].date) for name in names]
+    whole = replace(LOCK, suites=tuple(suites))
+    for lock, missing in ((whole, []), (replace(LOCK, suites=tuple(suites[:2])), ["bookworm-security"])):
+        assert list(parse_lock(format_lock(lock), "board", "board.lock").missing_suites) == missing
+        out = tmp_path / str(len(missing))
+        out.mkdir()
+        manifest.sboms("board", lock, STATUS, out)
+        spdx, cdx = (json.loads((out / f"sbom.{ending}").read_text()) for ending in manifest.SBOMS)
+        assert ("bookworm-security" in spdx.get("comment", "")) == bool(missing)
+        told = [each["value"] for each in cdx["metadata"].get("properties", []) if each["name"].startswith("flotilla")]
+        assert told == missing
+        made = manifest.read(written(fleet, out / "image", lock=lock), "make image")
+        assert made.lock.missing_suites == missing
+
+
+def test_every_build_says_in_one_line_what_its_lock_lacks(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    locks = {"smartcoret3": replace(LOCK, name="smartcoret3"), "x86_64": read_lock("x86_64")}
+    monkeypatch.setattr("images.builder.build.host.check", lambda: None)
+    monkeypatch.setattr("images.builder.build.namespace.check", lambda: None)
+    monkeypatch.setattr("images.builder.build.cache.exclusive", nullcontext)
+    monkeypatch.setattr(build, "check_tasks", lambda *_: None)
+    monkeypatch.setattr(build, "board_build", lambda board: SimpleNamespace(lock=locks[board.name]))
+    monkeypatch.setattr(build, "_robot_image", lambda *_: Path("robot.img"))
+    build.build(fleet, [fleet.robots[number] for number in (1, 2, 3)])
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("smartcoret3: its packages are locked without bookworm-updates, bookworm-security, whose")
 
 
 def test_order_of_lists_does_not_matter() -> None:
@@ -194,7 +229,9 @@ EXTENTS = [
 ]
 
 
-def written(fleet: Fleet, directory: Path, number: int = 3, source: manifest.Source | None = None) -> Path:
+def written(
+    fleet: Fleet, directory: Path, number: int = 3, source: manifest.Source | None = None, lock: Lock | None = None
+) -> Path:
     common = directory / "common"
     common.mkdir(parents=True)
     same = manifest.Shared(
@@ -204,8 +241,9 @@ def written(fleet: Fleet, directory: Path, number: int = 3, source: manifest.Sou
     for ending in manifest.SBOMS:
         (common / f"sbom.{ending}").write_text(ending)
     image = directory / f"robot{number}.img"
+    locks = lock or read_lock("smartcoret3"), read_lock("tools")
     manifest.write(
-        fleet, fleet.robots[number], (read_lock("smartcoret3"), read_lock("tools")), common, nodes=NODES, source=source,
+        fleet, fleet.robots[number], locks, common, nodes=NODES, source=source,
         data=manifest.Part(name="data partition", bytes=9, sha256="1"),
         image=manifest.Part(name=image.name, bytes=card.SIZE, sha256="2"), extents=EXTENTS, beside=image,
     )  # fmt: skip

@@ -182,7 +182,7 @@ def test_switches() -> None:
     assert "-S" not in plain
     assert "-no-reboot" not in plain
     assert values(plain, "-mon") == []
-    assert values(plain, "-action") == ["watchdog=reset"]
+    assert values(plain, "-action") == ["watchdog=none"]
     argv = command_line(board(), paused=True, reboot=False, watchdog="pause", qmp="socket,fd=5", extra=("-d", "int"))
     assert "-S" in argv
     assert "-no-reboot" in argv
