@@ -205,11 +205,12 @@ setup: $(VENV)/.complete ## install what building needs
 setup-tests: setup ## install what testing needs
 	$(Q)images/install-host-packages tests/host-packages.txt
 
-$(VENV)/.complete: requirements.lock images/host-packages.txt
+$(VENV)/.complete: requirements.lock requirements-source.lock images/host-packages.txt
 	$(Q)images/install-host-packages images/host-packages.txt
 	$(Q)rm -rf $(VENV)
 	$(Q)python3 -m venv $(VENV)
 	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r requirements.lock
+	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --no-deps --no-build-isolation -r requirements-source.lock
 	$(Q)touch $@
 
 clean: ## remove all outputs; keys stay
