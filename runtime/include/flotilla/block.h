@@ -215,8 +215,8 @@ struct fl_block_type {
     int (*start)(struct fl_block *block);
     int (*initialize)(struct fl_block *block);
     int (*step)(struct fl_block *block);
-    /* Until something came, or CLOCK_MONOTONIC is `until_ns`: when it came, or 0 if nothing did. The step has just that:
-     * it takes nothing newer than what released it. */
+    /* Until something came, or CLOCK_MONOTONIC is `until_ns`: when it came, or 0 if nothing did. The step has just
+     * that: it takes nothing newer than what released it. */
     int64_t (*await)(struct fl_block *block, int64_t until_ns);
     void (*safe)(struct fl_block *block);
     void (*terminate)(struct fl_block *block);
