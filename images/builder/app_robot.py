@@ -184,7 +184,7 @@ class _Interrupts:
             self._run.stdin.close()
 
     def _handle(self, *_: object) -> None:
-        if self.any:
+        if self.any and self._run:  # while it is being started, all are one
             raise KeyboardInterrupt
         self.end()
 
@@ -223,6 +223,8 @@ def run(to: Connection, name: str, show: Show) -> str:
                 try:
                     take(line)
                 except KeyboardInterrupt:
+                    if interrupts.any:
+                        raise
                     interrupts.end()
             if not ended and not interrupts.any:
                 raise to.error(process.wait(), process.stderr.read())
