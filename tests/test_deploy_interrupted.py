@@ -85,7 +85,7 @@ def test_an_interrupt_says_what_the_robot_has(said: dict[str, Any]) -> None:
 
 
 def test_what_fails_in_the_foreground_is_not_started_again(said: dict[str, Any]) -> None:
-    """Seen to fail with six starts: the actuator moved six times. What goes on by itself does start again."""
+    """Seen to fail with five starts: the actuator moved five times. What goes on by itself does start again."""
     assert said["fails"]["starts"] == 1, said["fails"]
     assert said["fails"]["status"] == 1
     assert "hover ended: exit-code" in said["fails"]["err"]
