@@ -214,7 +214,7 @@ def test_a_step_that_a_unit_refuses_ends_the_task(
 
 
 def test_a_unit_that_has_come_to_its_end_ends_the_task_in_good_order(flotilla_run: Path, apps: dict[str, Path]) -> None:
-    """Seen to fail as a failure, after which the service manager started it again, five times."""
+    """Seen to fail as a failure, after which the service manager starts it again."""
     said: list[str] = []
     task = "period: 10 ms\npriority: 0\nblocks:\n" + STATUS.replace("STATUS", "100")
     run(flotilla_run, build(apps["3"]), task, err=said)

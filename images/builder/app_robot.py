@@ -49,10 +49,15 @@ class Connection:
 
     def run(self, command: str, name: str, *arguments: str, stdin: bytes = b"") -> str:
         """Run it; what it says. UserError with the reason when it refuses or the robot does not answer."""
-        done = subprocess.run(self.argv(command, name, *arguments), input=stdin, capture_output=True, check=False)
-        if done.returncode:
-            raise self.error(done.returncode, done.stderr.decode(errors="replace"))
-        return done.stdout.decode(errors="replace")
+        with _started(self.argv(command, name, *arguments)) as process:
+            try:
+                said, failure = process.communicate(stdin)
+            except BaseException:
+                process.kill()
+                raise
+        if process.returncode:
+            raise self.error(process.returncode, failure.decode(errors="replace"))
+        return said.decode(errors="replace")
 
     def stream(self, command: str, name: str, *arguments: str, stdin: Path, stdout: Path, log: Path) -> None:
         """Run it between two files; what it says besides is shown as it comes, and kept in `log`."""
@@ -83,6 +88,22 @@ class Connection:
                 "another robot's card is in it, its image was made with other keys, or somebody is in between\n" + said
             )
         return boot.no_answer(self.robot, said or "the connection broke")
+
+
+def _started(argv: Sequence[str]) -> subprocess.Popen[bytes]:
+    """A process with pipes. Ctrl-C meanwhile leaves none behind, which would hold its end of the robot's command."""
+    interrupts: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
+    pipe = subprocess.PIPE
+    try:
+        process = subprocess.Popen(argv, stdin=pipe, stdout=pipe, stderr=pipe)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupts:
+        with process:
+            process.kill()
+        raise KeyboardInterrupt
+    return process
 
 
 @contextmanager
@@ -163,7 +184,7 @@ class _Interrupts:
             self._run.stdin.close()
 
     def _handle(self, *_: object) -> None:
-        if self.any:
+        if self.any and self._run:  # while it is being started, all are one
             raise KeyboardInterrupt
         self.end()
 
@@ -202,6 +223,8 @@ def run(to: Connection, name: str, show: Show) -> str:
                 try:
                     take(line)
                 except KeyboardInterrupt:
+                    if interrupts.any:
+                        raise
                     interrupts.end()
             if not ended and not interrupts.any:
                 raise to.error(process.wait(), process.stderr.read())
