@@ -28,7 +28,7 @@ from tests.emulators.ir104 import Ir104
 from tests.emulators.serial_line import SerialLine, UnixSocket
 from tests.lab.relay_ports import RelayPorts
 
-pytestmark = [pytest.mark.boot, pytest.mark.alone]
+pytestmark = pytest.mark.boot
 
 UNIT = "flotilla-task@heading.service"
 TASK = paths.TASKS / "heading.yml"

@@ -26,7 +26,7 @@ from tests.lab import fleet as virtual
 from tests.lab.guest import Guest
 from tests.lab.ssh import Ssh
 
-pytestmark = [pytest.mark.boot, pytest.mark.alone]
+pytestmark = pytest.mark.boot
 
 ANSIBLE = paths.PROJECT / "ansible"
 BOOT_SECONDS = 600
