@@ -1,6 +1,7 @@
 #include "igps_datagram.h"
 #include "udp.h"
 
+#include <flotilla/driver.h>
 #include <flotilla/sensor.h>
 
 struct igps {
@@ -26,10 +27,14 @@ static const struct fl_port outputs[] = {
 };
 
 enum { POSITION, FLAG, AGE, SEQUENCE, DROPPED };
+enum { PATIENCE_S = 5 }; /* without a datagram, before that is said */
 
 struct state {
     struct udp_receiver receiver;
     struct fl_sensor sensor;
+    struct fl_step_reasons *reasons;
+    uint32_t refused; /* before this step */
+    int64_t heard_ns; /* when the last step was that took a datagram, or the first one */
 };
 
 static int configure(struct fl_block *block)
@@ -43,8 +48,24 @@ static int start(struct fl_block *block)
     const struct igps *igps = block->parameters;
     struct state *state = block->state;
     fl_sensor_begin(&state->sensor);
+    state->reasons = fl_step_reasons_start(block);
+    if (!state->reasons)
+        return FL_FAILED;
     return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from,
                              igps->failover, IGPS_BYTES);
+}
+
+/* Why there is no position, where more is known than that none came just now. */
+static const char *reason_of(const struct state *state, const struct fl_block *block, bool unseen)
+{
+    if (unseen)
+        return "the system does not see the robot: a position is no number, or farther than `range`; with another "
+               "`byte_order` all are";
+    if (state->receiver.refused != state->refused)
+        return "what comes is refused: it has not 16 bytes, or its sender is not in `from`";
+    if (block->release_ns - state->heard_ns > PATIENCE_S * INT64_C(1000000000))
+        return "no position comes: start the program that sends them to this port";
+    return NULL;
 }
 
 static int step(struct fl_block *block)
@@ -54,12 +75,18 @@ static int step(struct fl_block *block)
     uint8_t bytes[IGPS_BYTES];
     int64_t arrived_ns;
     int budget = UDP_BURST;
+    bool unseen = false;
+    state->refused = state->receiver.refused;
+    if (block->step == 0)
+        state->heard_ns = block->release_ns;
     while (udp_receive(&state->receiver, bytes, &arrived_ns, &budget)) {
+        state->heard_ns = block->release_ns;
         struct igps_position position;
         /* A right datagram with a number that cannot be is the system saying that it does not see the robot; one of
          * another length is not of the system, and says nothing. */
         if (!igps_read(bytes, sizeof bytes, (enum igps_byte_order)igps->byte_order, igps->range, &position)) {
             fl_sensor_invalidate(&state->sensor);
+            unseen = true;
             continue;
         }
         ((double *)block->out[POSITION])[0] = position.x;
@@ -68,12 +95,16 @@ static int step(struct fl_block *block)
     }
     fl_sensor_outputs(&state->sensor, block, FLAG, true, igps->timeout);
     udp_receiver_outputs(&state->receiver, block, DROPPED);
+    const char *reason = FL_OUT(block, FLAG, bool) ? NULL : reason_of(state, block, unseen);
+    if (reason)
+        fl_step_reasons_tell(state->reasons, reason);
     return FL_OK;
 }
 
 static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
+    fl_step_reasons_stop(state->reasons);
     udp_receiver_close(&state->receiver);
 }
 

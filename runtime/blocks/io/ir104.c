@@ -7,7 +7,7 @@
 #include "ports.h"
 
 #include <errno.h>
-#include <flotilla/block.h>
+#include <flotilla/driver.h>
 #include <inttypes.h>
 #include <math.h>
 #include <string.h>
@@ -63,6 +63,7 @@ struct state {
     uint32_t commanded;
     int64_t commanded_ns; /* when the last command was new */
     uint32_t sequence;
+    struct fl_step_reasons *reasons;
 };
 
 static unsigned channel(const struct ir104 *ir104, size_t index)
@@ -159,7 +160,8 @@ static int start(struct fl_block *block)
     if (error)
         return fl_fail(block, "I/O ports 0x%x to 0x%x: %s", state->base, state->base + PORTS - 1, strerror(error));
     state->permitted = true;
-    return FL_OK;
+    state->reasons = fl_step_reasons_start(block);
+    return state->reasons ? FL_OK : FL_FAILED;
 }
 
 static int initialize(struct fl_block *block)
@@ -211,6 +213,9 @@ static int step(struct fl_block *block)
     write_relays(state, state->commanded);
     uint32_t read_back = read_bits(state, RELAYS_AT), opto = read_bits(state, INPUTS_AT);
     FL_OUT(block, MISMATCH, bool) = (read_back & ALL_RELAYS) != state->commanded;
+    if (FL_OUT(block, MISMATCH, bool))
+        fl_step_reasons_tell(state->reasons, "relays do not read back as they were written: look at the board's jumper "
+                                             "for `base`, and at its power");
     for (size_t i = 0; i < ir104->channels.count; i++)
         ((bool *)block->out[READ_BACK])[i] = read_back >> channel(ir104, i) & 1;
     for (unsigned i = 0; i < INPUTS; i++)
@@ -233,6 +238,7 @@ static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
     safe(block);
+    fl_step_reasons_stop(state->reasons);
     if (state->permitted)
         port_space->permit(state->base, PORTS, false);
     state->permitted = false;

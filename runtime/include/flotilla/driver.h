@@ -57,6 +57,18 @@ void fl_reasons_tell(struct fl_reasons *reasons, struct fl_block *block, int64_t
 /* The device is good. Once it has been so for FL_REASONS_STEADY_S, what goes wrong then is told anew. */
 void fl_reasons_good(struct fl_reasons *reasons, int64_t now_ns);
 
+/* The same for what only a step sees: it stores, and a thread of ordinary priority looks once a second, and logs. */
+struct fl_step_reasons;
+
+/* Start the thread. NULL after fl_fail(). */
+struct fl_step_reasons *fl_step_reasons_start(struct fl_block *block);
+
+/* Why the device is not good in this step; for the step. `reason` has to last as long as the block. */
+void fl_step_reasons_tell(struct fl_step_reasons *reasons, const char *reason);
+
+/* NULL is allowed. */
+void fl_step_reasons_stop(struct fl_step_reasons *reasons);
+
 /* --- serial port --- */
 
 /* Members and parameters of a block with a serial port, as the port's mask lists them. */

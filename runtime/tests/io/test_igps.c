@@ -1,5 +1,6 @@
 #define _GNU_SOURCE
 #include "loopback.h"
+#include "said.h"
 
 #include "blocks/io/igps_datagram.h"
 
@@ -198,6 +199,42 @@ static void flags_silence(void **state)
     testbed_end(igps);
 }
 
+/* Each cause by a block of its own: what its last step saw is logged at its end. */
+static void says_why_there_is_no_position(void **state)
+{
+    (void)state;
+    struct system system = a_system();
+    struct said said = said_begin();
+    struct fl_block *igps = testbed_block("igps", "port", system.port, "range", "10", "timeout", "60", NULL);
+    testbed_begin(igps);
+    step(igps);
+    testbed_end(igps);
+    assert_int_equal(said_times(&said, "igps: "), 0); /* too early to tell */
+    igps = testbed_block("igps", "port", system.port, "range", "10", "timeout", "60", NULL);
+    testbed_begin(igps);
+    step(igps);
+    igps->release_ns += INT64_C(5000000001) - igps->period_ns;
+    testbed_step(igps);
+    testbed_end(igps);
+    assert_int_equal(said_times(&said, "no position comes"), 1);
+    igps = testbed_block("igps", "port", system.port, "range", "10", "timeout", "60", NULL);
+    testbed_begin(igps);
+    send_position(&system, NAN, 2);
+    step(igps);
+    testbed_end(igps);
+    assert_int_equal(said_times(&said, "does not see the robot"), 1);
+    igps = testbed_block("igps", "port", system.port, "range", "10", "timeout", "60", NULL);
+    testbed_begin(igps);
+    step(igps);
+    send_bytes(&system, "not of the system", 17);
+    step(igps);
+    testbed_end(igps);
+    assert_int_equal(said_times(&said, "what comes is refused"), 1);
+    assert_int_equal(said_times(&said, "igps: "), 3);
+    said_end(&said);
+    close(system.fd);
+}
+
 static void refuses(void **state)
 {
     (void)state;
@@ -212,10 +249,15 @@ static void refuses(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(reads_both_orders),    cmocka_unit_test(refuses_what_cannot_be),
-        cmocka_unit_test(believes_what_can_be), cmocka_unit_test(follows),
-        cmocka_unit_test(follows_big_endian),   cmocka_unit_test(flags_what_cannot_be),
-        cmocka_unit_test(flags_silence),        cmocka_unit_test(refuses),
+        cmocka_unit_test(reads_both_orders),
+        cmocka_unit_test(refuses_what_cannot_be),
+        cmocka_unit_test(believes_what_can_be),
+        cmocka_unit_test(follows),
+        cmocka_unit_test(follows_big_endian),
+        cmocka_unit_test(flags_what_cannot_be),
+        cmocka_unit_test(flags_silence),
+        cmocka_unit_test(says_why_there_is_no_position),
+        cmocka_unit_test(refuses),
     };
     stay_on_one_processor();
     return cmocka_run_group_tests(tests, NULL, NULL);

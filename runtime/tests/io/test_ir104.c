@@ -1,5 +1,5 @@
 #define _GNU_SOURCE
-#include "testbed.h"
+#include "said.h"
 
 #include "blocks/io/ports.h"
 #include "executive/service.h"
@@ -229,6 +229,7 @@ static void tells_a_mismatch(void **state)
 {
     (void)state;
     struct fl_block *block = testbed_block("ir104-pbf", "channels", "9,10", NULL);
+    struct said said = said_begin();
     testbed_begin(block);
     board.stuck[1] = 1 << 1; /* relay 10 */
     command(block, true, (bool[]){1, 0}, 2);
@@ -243,6 +244,8 @@ static void tells_a_mismatch(void **state)
     command(block, true, (bool[]){1, 1}, 2);
     assert_false(GET(block, "mismatch", bool));
     testbed_end(block);
+    assert_int_equal(said_times(&said, "relays do not read back as they were written"), 1);
+    said_end(&said);
 }
 
 /* flotilla-run --safe: nothing but start, safe, terminate, whatever the board was left in. */
