@@ -17,6 +17,9 @@ from tests.virtual_loop import SECONDS, TARGET_RAD_S, run
 
 pytestmark = pytest.mark.boot
 
+UNREADY = 80
+"""Frames that give no rate: those until the driver is sure of the gyro's mode, and those that its commands garble, which
+this line brings back. It says the mode anew every 100 frames. Which ones they are is judged by the accepted histogram."""
 SETTLED = 300
 """Steps after which the velocity loop, whose drive first has to be configured, has to hold."""
 
@@ -39,7 +42,7 @@ def read(text: str) -> dict[str, Any]:
 def test_a_frame_becomes_a_valve_within_two_periods(said: dict[str, str]) -> None:
     histogram = virtual_loop.chain(said).histogram_us
     assert read(said["chain"])["late"] == 0
-    assert sum(histogram.values()) >= SECONDS * 100 - 60, "frames are lost"
+    assert sum(histogram.values()) >= SECONDS * 100 - UNREADY, "frames are lost"
     print(f"frame to valve: {min(histogram)} to {max(histogram)} µs")
     assert max(histogram) < 20_000
 
