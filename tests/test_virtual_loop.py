@@ -18,8 +18,8 @@ from tests.virtual_loop import SECONDS, TARGET_RAD_S, run
 pytestmark = pytest.mark.boot
 
 UNREADY = 80
-"""Frames that give no rate: those until the driver is sure of the gyro's mode, and those that its commands garble, which
-this line brings back. It says the mode anew every 100 frames. Which ones they are is judged by the accepted histogram."""
+"""Frames that give no rate: those until the driver is sure of the gyro's mode, and those that its commands garble, as
+this line brings them back. It says the mode anew every 100 frames. The accepted histogram counts them exactly."""
 SETTLED = 300
 """Steps after which the velocity loop, whose drive first has to be configured, has to hold."""
 
