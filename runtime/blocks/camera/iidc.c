@@ -1,6 +1,7 @@
 /* The block `frame-grabber-iidc`: a FireWire camera by libdc1394, over the kernel's firewire-ohci. A plug-in, so that
  * robots without such a camera need no libdc1394. */
 #define _GNU_SOURCE
+#include "drivers/wall_clock.h"
 #include "grabber.h"
 
 #include <dc1394/dc1394.h>
@@ -128,10 +129,8 @@ static bool open_session(struct session *session, struct grabber *grabber)
 static int64_t taken_ns(const dc1394video_frame_t *frame)
 {
     enum { PLAUSIBLE_US = 1000 * 1000 };
-    struct timespec real;
     int64_t now_ns = fl_now_ns();
-    clock_gettime(CLOCK_REALTIME, &real);
-    int64_t age_us = real.tv_sec * INT64_C(1000000) + real.tv_nsec / 1000 - (int64_t)frame->timestamp;
+    int64_t age_us = (now_ns + wall_less_monotonic_ns()) / 1000 - (int64_t)frame->timestamp;
     return age_us > 0 && age_us < PLAUSIBLE_US ? now_ns - age_us * 1000 : now_ns;
 }
 

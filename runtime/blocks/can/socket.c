@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "socket.h"
 
+#include "drivers/wall_clock.h"
+
 #include <errno.h>
 #include <linux/can/error.h>
 #include <linux/can/raw.h>
@@ -185,14 +187,13 @@ static void judge(struct can_socket *can, int error)
 static int64_t arrival(struct msghdr *message)
 {
     enum { PLAUSIBLE_NS = 1000 * 1000 * 1000 };
-    struct timespec stamp, real;
-    int64_t now_ns = fl_now_ns(), age_ns = 0;
-    clock_gettime(CLOCK_REALTIME, &real);
+    struct timespec stamp;
+    int64_t now_ns = fl_now_ns(), wall_ns = now_ns + wall_less_monotonic_ns(), age_ns = 0;
     for (struct cmsghdr *part = CMSG_FIRSTHDR(message); part; part = CMSG_NXTHDR(message, part)) {
         if (part->cmsg_level != SOL_SOCKET || part->cmsg_type != SCM_TIMESTAMPNS)
             continue;
         memcpy(&stamp, CMSG_DATA(part), sizeof stamp);
-        age_ns = ns_of(&real) - ns_of(&stamp);
+        age_ns = wall_ns - ns_of(&stamp);
     }
     return age_ns > 0 && age_ns < PLAUSIBLE_NS ? now_ns - age_ns : now_ns;
 }

@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "udp.h"
 
+#include "drivers/wall_clock.h"
+
 #include <arpa/inet.h>
 #include <errno.h>
 #include <linux/filter.h>
@@ -107,13 +109,6 @@ int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_
     return arrived_ns < emptied_ns ? emptied_ns : arrived_ns;
 }
 
-static int64_t wall_ns(void)
-{
-    struct timespec wall;
-    clock_gettime(CLOCK_REALTIME, &wall);
-    return wall.tv_sec * INT64_C(1000000000) + wall.tv_nsec;
-}
-
 static int64_t read_stamp(struct msghdr *message)
 {
     for (struct cmsghdr *control = CMSG_FIRSTHDR(message); control; control = CMSG_NXTHDR(message, control)) {
@@ -173,9 +168,8 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
             break;
         size_t rank = rank_of(receiver, &sender);
         int64_t stamp_ns = read_stamp(&message);
-        /* In this order: what delays between the two lets the datagram look older, never younger. */
-        int64_t now_ns = fl_now_ns();
-        int64_t came_ns = udp_arrival_ns(stamp_ns, wall_ns(), now_ns, receiver->emptied_ns);
+        int64_t now_ns = fl_now_ns(), wall_ns = now_ns + wall_less_monotonic_ns();
+        int64_t came_ns = udp_arrival_ns(stamp_ns, wall_ns, now_ns, receiver->emptied_ns);
         if (fl_failover_takes(&receiver->failover, rank, came_ns, receiver->failover_timeout)) {
             receiver->sender = (uint32_t)rank;
             *arrived_ns = came_ns;

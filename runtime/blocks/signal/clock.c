@@ -1,4 +1,4 @@
-#include "wall_clock.h"
+#include "drivers/wall_clock.h"
 
 #include <flotilla/block.h>
 

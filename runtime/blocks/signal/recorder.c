@@ -16,8 +16,8 @@
  * Whoever is killed leaves whole records, for they are written by whole ones; where power went, the check tells which
  * are good, and half a record at the end is none. The reader is runtime/station/recording.py. */
 #define _GNU_SOURCE
+#include "drivers/wall_clock.h"
 #include "layout.h"
-#include "wall_clock.h"
 
 #include <dirent.h>
 #include <errno.h>
