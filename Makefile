@@ -210,7 +210,8 @@ $(VENV)/.complete: requirements.lock requirements-source.lock images/host-packag
 	$(Q)rm -rf $(VENV)
 	$(Q)python3 -m venv $(VENV)
 	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r requirements.lock
-	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --no-deps --no-build-isolation -r requirements-source.lock
+	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --no-deps --no-build-isolation --use-pep517 \
+	    -r requirements-source.lock
 	$(Q)touch $@
 
 clean: ## remove all outputs; keys stay
