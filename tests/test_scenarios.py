@@ -130,8 +130,8 @@ def test_the_published_square(published: dict[str, Flight], name: str) -> None:
 
 
 def test_no_message_arrives_before_it_is_sent(flown: dict[str, Flight]) -> None:
-    """Late and lost ones included. Seen to fail where an interrupt between readings of two clocks made an arrival older:
-    a hop of -22 µs in the flight with a stranger."""
+    """Late and lost ones included. Seen to fail where an interrupt between two readings made an arrival older: a
+    hop of -22 µs in the flight with a stranger."""
     faults = {name: flight.faults(disturbed=True) for name, flight in flown.items()}
     assert not any(faults.values()), faults
 
