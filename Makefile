@@ -1,129 +1,190 @@
 # Front door. `make help` lists the targets; V=1 shows the commands.
-# `make deploy BUILD=remote` compiles on the robot, as ON_ROBOT=1 does; of everything else BUILD is the directory of outputs.
-ifeq ($(BUILD) $(filter deploy,$(MAKECMDGOALS)),remote deploy)
-override BUILD := build
-ON_ROBOT := 1
-endif
 BUILD ?= build
 # Paths that stand in commands as they are.
 not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$
 in_path = $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1))
-$(foreach name,BUILD KEYS,$(if $(strip $(call in_path,$(name))),$(error $(name)=$(value $(name)): is a path with blanks \
+$(foreach name,BUILD KEYS APPS,$(if $(strip $(call in_path,$(name))),$(error $(name)=$(value $(name)): is a path with blanks \
     or with a character that means something to a shell; take another directory)))
 export BUILD
 VENV := $(BUILD)/venv
 PYTHON := $(VENV)/bin/python
-FLOTILLA := $(PYTHON) -m images.builder
+FLOTILLA := $(PYTHON) -m flotilla
+# A part of a command: a line that moves on a terminal, a line at its end without one; what it says when it fails.
+step = $(PYTHON) -m flotilla.common.progress
 Q := $(if $(filter-out 0,$(V)),,@)
-export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS
+export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS
 MAKEFLAGS += --no-print-directory
 .DEFAULT_GOAL := help
 
 ##@ Cards
-.PHONY: image images kernel flash boot ssh verify size
+.PHONY: image images kernel flash boot ssh verify bundle size
 image: | setup ## card image of one robot: make image ROBOT=3
-	$(Q)$(FLOTILLA) image --robot $(call need,ROBOT)
+	$(Q)$(FLOTILLA) image $(call need,ROBOT)
 
 images: | setup ## card images of the whole fleet
 	$(Q)$(FLOTILLA) image --all
 
-kernel: | setup ## our own real-time kernel as a Debian package: make kernel BOARD=smartcoret3
-	$(Q)$(FLOTILLA) kernel --board $(call need,BOARD)
+kernel: | setup ## our own real-time kernel as a Debian package: make kernel [BOARD=]
+	$(Q)$(FLOTILLA) kernel $(if $(value BOARD),$(call given,BOARD))
 
 flash: | setup ## write a card and read it back: make flash ROBOT=3 DEV=/dev/sdX (or CARD=file)
-	$(Q)$(FLOTILLA) flash --robot $(call need,ROBOT) $(or $(call option,--file,CARD),--device $(call need,DEV)) \
+	$(Q)$(FLOTILLA) flash $(call need,ROBOT) $(or $(call option,--file,CARD),$(call need,DEV)) \
 	    $(call option,--force,FORCE)
 
 boot: | setup-tests ## boot a robot's image in QEMU on this terminal
-	$(Q)$(FLOTILLA) boot --robot $(call need,ROBOT)
+	$(Q)$(FLOTILLA) boot $(call need,ROBOT)
 
 ssh: | setup ## shell on a robot, or on its guest when one runs: make ssh ROBOT=3
-	$(Q)$(FLOTILLA) ssh --robot $(call need,ROBOT)
+	$(Q)$(FLOTILLA) ssh $(call need,ROBOT)
 
 verify: | setup ## build a second time under other circumstances and compare to the byte
-	$(Q)$(FLOTILLA) verify --robot $(call need,ROBOT)
+	$(Q)$(FLOTILLA) verify $(call need,ROBOT)
+
+bundle: | setup ## the release of a board for robots in service: make bundle [BOARD=] [SIGNATURES="FILE ..."]
+	$(Q)$(FLOTILLA) bundle $(if $(value BOARD),$(call given,BOARD)) $(addprefix --signature=,$(call each_given,SIGNATURES))
 
 size: | setup ## the largest packages and files of a robot's image
-	$(Q)$(FLOTILLA) size --robot $(call need,ROBOT)
+	$(Q)$(FLOTILLA) size $(call need,ROBOT)
 
 ##@ Fleet
-.PHONY: fleet fleet-status fleet-down fleet-scale provision
+.PHONY: fleet fleet-status fleet-down fleet-scale provision update releases
 fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
-	$(Q)$(PYTHON) -m tests.lab.fleet up $(call need,N)
+	$(Q)$(FLOTILLA) fleet up $(call need,N)
 
 fleet-status: | setup-tests ## what the guests of the virtual fleet do
-	$(Q)$(PYTHON) -m tests.lab.fleet status
+	$(Q)$(FLOTILLA) fleet status
 
 fleet-down: | setup-tests ## end the virtual fleet
-	$(Q)$(PYTHON) -m tests.lab.fleet down
+	$(Q)$(FLOTILLA) fleet down
 
-fleet-scale: | setup-tests ## how provisioning grows with the fleet, on light robots, as root: make fleet-scale N=32 [BOARD=]
-	$(Q)$(PYTHON) -m tests.lab.scale measure $(call need,N) $(call option,--board,BOARD)
+fleet-scale: | setup-tests ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
+	$(Q)$(FLOTILLA) fleet-scale $(call need,N) $(call option,--board,BOARD)
+
+update: | setup ## robots take the bundle of their board: make update [ROBOT=3] [ON=guests] [ARGS="-e stop_tasks=true"]
+	$(Q)$(MAKE) provision PLAYBOOK=update
 
 provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [ARGS=--check]
-	$(Q)cd ansible && export PATH="$(abspath $(VENV))/bin:$$PATH" BUILD="$(abspath $(BUILD))" && \
-	    $(if $(KEYS),KEYS="$(abspath $(KEYS))") ansible-playbook -i inventory \
-	    $(if $(filter guests,$(ON)),-i $(abspath $(BUILD))/fleet/guests.yml -l $(if $(value ROBOT),robot$(call given,ROBOT),guests), \
-	        $(if $(value ROBOT),-l robot$(call given,ROBOT))) $(call each_given,ARGS) $(if $(value PLAYBOOK),$(call given,PLAYBOOK),fleet).yml
+	$(Q)$(FLOTILLA) provision $(call option,--robot,ROBOT) $(if $(filter guests,$(ON)),--guests) $(call option,--playbook,PLAYBOOK) \
+	    $(if $(value ARGS),-- $(call each_given,ARGS))
+
+releases: | setup ## which release each robot runs, since when, on trial or confirmed: make releases [ROBOT=3] [JSON=1]
+	$(Q)$(FLOTILLA) releases $(if $(value ROBOT),$(call given,ROBOT)) $(if $(filter-out 0,$(JSON)),--json)
 
 ##@ Apps
 .PHONY: new-app deploy
 new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|fmu|make NAME=hover
-	$(Q)$(FLOTILLA) new-app --kind $(call need,KIND) --name $(call need,NAME)
+	$(Q)$(FLOTILLA) new-app $(call need,KIND) $(call need,NAME)
 
-deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [BUILD=remote] [KEEP=1 | RUN=start|stop|status|log|remove]
-	$(Q)$(FLOTILLA) deploy --robot $(call need,ROBOT) --app $(call need,APP) $(call option,--run,RUN) \
+deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [ON_ROBOT=1] [KEEP=1 | RUN=start|stop|status|log|remove]
+	$(Q)$(FLOTILLA) deploy $(call need,ROBOT) $(call need,APP) $(call option,--run,RUN) \
 	    $(if $(filter-out 0,$(KEEP)),--keep) $(if $(filter-out 0,$(ON_ROBOT)),--on-robot)
 
 ##@ Inputs
-.PHONY: lock check-fleet requirements
-lock: | setup ## resolve the package lists against the mirror: exact versions and hashes
-	$(Q)$(FLOTILLA) lock
+.PHONY: lock cve check-fleet requirements rotate-key
+lock: | setup ## resolve the package lists against the mirror: exact versions and hashes [ONLY=name of a lock]
+	$(Q)$(FLOTILLA) lock $(call option,--only,ONLY)
+
+cve: | setup ## known vulnerabilities of what the locks hold, by Debian's tracker: make cve TRACKER=FILE or address [JSON=1]
+	$(Q)$(FLOTILLA) cve $(call option,--tracker,TRACKER) $(if $(filter-out 0,$(JSON)),--json)
 
 check-fleet: | setup ## validate the fleet's description
 	$(Q)$(FLOTILLA) check-fleet
+
+rotate-key: | setup ## a new host key for a robot: make rotate-key ROBOT=3, provision it, then RETIRE=1
+	$(Q)$(FLOTILLA) rotate-key $(call need,ROBOT) $(if $(filter-out 0,$(RETIRE)),--retire)
 
 requirements: | setup ## lock the Python environment anew from requirements.in
 	$(Q)$(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	    --no-header --no-annotate --quiet requirements.in -o requirements.lock
 
 ##@ Quality
-.PHONY: check test test-all bench
-check: | setup-tests ## lint, types and unit tests, of the runtime too; no images, no QEMU
-	$(Q)$(VENV)/bin/ruff format --check .
-	$(Q)$(VENV)/bin/ruff check .
-	$(Q)$(VENV)/bin/mypy
-	$(Q)$(VENV)/bin/mypy ansible/library ansible/plugins
-	$(Q)$(call shell_scripts) | xargs shellcheck
-	$(Q)cd ansible && PATH="$(abspath $(VENV))/bin:$$PATH" ansible-lint --offline -q .
-	$(Q)$(MAKE) check-runtime
+.PHONY: check lint docs reference test test-all bench power-cuts
+check: | setup-tests lint check-runtime ## lint, types and unit tests, of the runtime too; no images, no QEMU
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 
-tests = tests --ignore=tests/unit --durations=20 --durations-min=10
-test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU: everything but what test-all adds
-	$(Q)$(MAKE) -j2 test-kernel test-images
-	@# Both, whatever the first one says.
-	$(Q)$(VENV)/bin/pytest $(tests) -m 'alone and not long'; status=$$?; \
-	    $(VENV)/bin/pytest $(tests) -m 'not alone and not long' -n 2 --dist loadfile && exit $$status
+docs: | setup ## the documentation as a site, in build/docs/index.html; warnings are errors, nothing is fetched
+	$(Q)$(step) "documentation" $(VENV)/bin/sphinx-build -q -E -W --keep-going -d $(BUILD)/docs/.doctrees docs $(BUILD)/docs
 
-# The kernel takes longest, and gets what checks and images leave of the processors.
-.PHONY: test-kernel test-images
-test-kernel: | setup-tests
-	$(Q)nice -n 19 $(FLOTILLA) kernel --board smartcoret3
+reference: | setup runtime ## write the pages of docs/reference that are made from the sources
+	$(Q)$(PYTHON) -m flotilla.reference
 
-# Without make's job server, which ninja cannot use from here.
-test-images: | setup-tests
-	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory check
-	@# With a seed, so that whoever changed nothing finds nothing.
-	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory fuzz SECONDS=3 SEED=1
-	$(Q)$(FLOTILLA) image --all
+lint: | setup-tests docs
+	$(Q)$(step) "Python's format" $(VENV)/bin/ruff format --check .
+	$(Q)$(step) "Python's rules" $(VENV)/bin/ruff check .
+	$(Q)$(step) "types" $(VENV)/bin/mypy
+	$(Q)$(step) "types of Ansible's plug-ins" $(VENV)/bin/mypy ansible/library ansible/plugins rootfs_overlay/usr/lib/flotilla/update.py
+	$(Q)$(step) "imports" $(VENV)/bin/lint-imports
+	$(Q)$(step) "shell scripts" shellcheck $$($(call shell_scripts))
+	$(Q)$(step) "playbooks" env -C ansible PATH="$(abspath $(VENV))/bin:$$PATH" ansible-lint --offline -q .
+
+# Three at a time: the kernel takes longest; tests that keep step with a clock come first, and need next to nothing;
+# all else is nice to them. Without make's job server, which ninja cannot use from here.
+COSTS = $(abspath $(BUILD))/reports/costs
+TIERS := unit runtime image boot nightly
+lanes_unit = test-others
+lanes_runtime = test-clock test-others
+lanes_image = test-others
+lanes_boot = test-kernel test-others
+lanes_nightly = $(lanes_boot)
+lanes_ = test-kernel test-clock test-others
+test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU; one tier alone: TIER=unit|runtime|image|boot|nightly
+	$(if $(filter-out $(TIERS),$(TIER)),$(error TIER=$(TIER): take one of $(TIERS)))
+	$(Q)mkdir -p $(dir $(COSTS)); rm -f $(COSTS)
+	$(Q)MAKEFLAGS= TIER=$(TIER) COSTS=$(COSTS) $(PYTHON) -m tests.costs run "in all" \
+	    $(MAKE) --no-print-directory -k -j3 $(lanes_$(TIER)); status=$$?; \
+	    $(PYTHON) -m tests.costs show $(COSTS); exit $$status
 
 test-all: test ## the same, and tests that take minutes for one answer
 	$(Q)images/install-host-packages tests/browser-packages.txt
-	$(Q)$(VENV)/bin/pytest tests -m long
+	$(Q)$(MAKE) test TIER=nightly
+
+.PHONY: test-kernel test-clock test-others
+run_tests = $(VENV)/bin/pytest tests --durations=20 --durations-min=10
+cost = nice -n 10 $(PYTHON) -m tests.costs run
+selected = $(or $(TIER),not nightly)
+test-kernel: | setup-tests
+	$(Q)$(cost) kernel $(FLOTILLA) kernel
+
+test-clock: | setup-tests
+	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory runtime
+	$(Q)$(run_tests) -m '$(selected) and clock' >$(COSTS).clock 2>&1; status=$$?; cat $(COSTS).clock; exit $$status
+
+test-others: | setup-tests
+ifeq ($(TIER),)
+	$(Q)MAKEFLAGS= $(cost) lint $(MAKE) --no-print-directory lint
+	$(Q)MAKEFLAGS= $(cost) check-runtime $(MAKE) --no-print-directory check-runtime
+	@# With a seed, so that whoever changed nothing finds nothing.
+	$(Q)MAKEFLAGS= $(cost) fuzz $(MAKE) --no-print-directory fuzz SECONDS=3 SEED=1
+endif
+	$(if $(filter unit runtime,$(TIER)),,$(Q)$(cost) images $(FLOTILLA) image --all)
+	$(Q)nice -n 10 $(run_tests) -m '$(selected) and not clock' -n 3
+
+# In a directory of outputs of its own, whose runtime counts; cache, pool and environment are the usual ones.
+covered = $(abspath $(BUILD))/coverage
+coverage_report = $(abspath $(BUILD))/reports/coverage
+coverage: export COVERAGE_FILE = $(covered)/.coverage
+coverage: | setup-tests ## branches of Python and C that unit and runtime tests take, in build/reports/coverage
+	$(Q)mkdir -p $(covered) $(coverage_report)/c; ln -sfn ../cache ../pool ../venv $(covered)
+	$(Q)find $(covered) -name '*.gcda' -delete; rm -f $(COVERAGE_FILE)*
+	$(Q)test -f $(covered)/runtime/build.ninja || $(meson) setup $(covered)/runtime runtime -Dtests=true \
+	    -Db_coverage=true -Dbuildtype=debug >/dev/null
+	$(Q)$(call compile,$(covered)/runtime)
+	$(Q)$(meson) test -C $(covered)/runtime --no-rebuild --print-errorlogs --quiet
+	@# What was taken is said of a red run, too.
+	$(Q)BUILD=$(covered) $(VENV)/bin/coverage run -m pytest -q tests -m 'unit or runtime'; echo $$? >$(covered)/status
+	@# A process that a test killed may leave half a file: it is named once, and counts for nothing.
+	$(Q)$(VENV)/bin/coverage combine --quiet && rm -f $(COVERAGE_FILE).*
+	$(Q)$(VENV)/bin/coverage html --quiet -d $(coverage_report)/python
+	$(Q)$(VENV)/bin/coverage report --sort=miss >$(coverage_report)/python.txt; tail -1 $(coverage_report)/python.txt
+	$(Q)$(VENV)/bin/gcovr --root runtime --exclude runtime/tests --txt-metric branch --txt $(coverage_report)/c.txt \
+	    --html-nested $(coverage_report)/c/index.html --print-summary $(covered)/runtime
+	$(Q)exit $$(cat $(covered)/status)
+
+power-cuts: | setup-tests ## every power cut of updates replayed: bricks, wrong releases, mistakes found [BOARD=] [MIB=16]
+	$(Q)$(FLOTILLA) power-cuts $(call option,--board,BOARD) $(call option,--mib,MIB)
 
 bench: | setup-tests ## wall times and ratios against other builders
-	$(Q)$(FLOTILLA) bench $(call option,--robot,ROBOT)
+	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
 .PHONY: runtime check-runtime fuzz bench-runtime param record live top
@@ -135,12 +196,12 @@ runtime: | setup-tests ## the runtime's programs for this computer, in build/run
 	$(Q)$(call compile,$(BUILD)/runtime)
 
 check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
-	$(Q)git ls-files '*.[ch]' | xargs $(VENV)/bin/clang-format --dry-run -Werror
+	$(Q)$(step) "format of C" $(VENV)/bin/clang-format --dry-run -Werror $$(git ls-files '*.[ch]')
 	$(Q)test -f $(BUILD)/runtime-sanitized/build.ninja || $(meson) setup $(BUILD)/runtime-sanitized runtime -Dtests=true \
 	    -Db_sanitize=address,undefined -Dbuildtype=debugoptimized >/dev/null
-	$(Q)$(call compile,$(BUILD)/runtime-sanitized)
-	$(Q)$(PYTHON) -m tests.tidy $(BUILD)/runtime-sanitized
-	$(Q)$(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
+	$(Q)$(step) "compilation with sanitizers" env $(meson) compile -C $(BUILD)/runtime-sanitized
+	$(Q)$(step) "clang-tidy" $(PYTHON) -m runtime.tidy $(BUILD)/runtime-sanitized
+	$(Q)$(step) "unit tests of C" env $(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
 fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60 SEED=]; finds go to build/found
 	$(Q)images/install-host-packages tests/fuzz-packages.txt
@@ -160,65 +221,80 @@ bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HA
 	    $(call option,--rounds,ROUNDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
-station = $(PYTHON) -m runtime.station $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS)
+station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS)
 record: | setup ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS=]
-	$(Q)$(station) --record $(call each_given,OUT) $(call option,--live,PORT)
+	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
 
 live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
-	$(Q)$(station) --live $(call each_given,PORT) $(call option,--record,OUT)
+	$(Q)$(FLOTILLA) live $(station) $(call option,--record,OUT) $(call each_given,PORT)
 
 top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
-	$(Q)$(station) --top $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
+	$(Q)$(FLOTILLA) top $(station) $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
 
 param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
-	$(Q)$(FLOTILLA) param --robot $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
+	$(Q)$(FLOTILLA) param $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
 
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck scenarios scenarios-accept
-LATENCY = $(PYTHON) -m tests.latency
 # What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.
-measured = --board $(if $(value BOARD),$(call given,BOARD),smartcoret3) $(call option,--kernel,KERNEL) $(call option,--plan,PLAN)
-latency: | setup-tests ## latency in virtual time within its limits, a control refused [BOARD= KERNEL=lean|debian|no-rt PLAN=quick|disk]; or TARGET=ssh:robot3
-	$(Q)$(LATENCY) measure $(measured) $(call option,--target,TARGET)
-	$(if $(TARGET),,$(Q)$(LATENCY) compare $(measured))
+measured = $(call option,--board,BOARD) $(call option,--kernel,KERNEL) $(call option,--plan,PLAN)
+latency: | setup-tests ## latency in virtual time against the accepted run, or limits (an hour): PLAN=standard [BOARD= KERNEL=lean|debian|no-rt PLAN=disk]; or TARGET=ssh:robot3
+	$(Q)$(FLOTILLA) latency $(measured) $(call option,--target,TARGET)
 
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
-	$(Q)$(FLOTILLA) hwcheck --robot $(call need,ROBOT) $(call option,--seconds,SECONDS)
+	$(Q)$(FLOTILLA) hwcheck $(call need,ROBOT) $(call option,--seconds,SECONDS)
 
 latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
-	$(Q)$(LATENCY) accept $(measured)
-	$(Q)$(PYTHON) -m tests.virtual_loop
+	$(Q)$(FLOTILLA) latency-accept $(measured)
 
 boot-time: | setup-tests ## where a boot spends its time, in virtual time
-	$(Q)$(LATENCY) boot-time $(measured)
+	$(Q)$(FLOTILLA) boot-time $(measured)
 
-scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=1] [FLIGHTS="udp dds"] [ON=guests | ROBOTS=16]
-	$(Q)$(PYTHON) -m tests.scenarios $(if $(filter guests,$(ON)),--guests) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call each_given,FLIGHTS)
+scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests | ROBOTS=16]
+	$(Q)$(FLOTILLA) scenarios $(if $(filter guests,$(ON)),--guests) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
 
-scenarios-accept: | setup-tests ## make a new run the accepted one: commit tests/scenarios/baseline.json
-	$(Q)$(PYTHON) -m tests.scenarios --accept
+scenarios-accept: | setup-tests ## make a new run the accepted one: commit lab/scenarios/baseline.json
+	$(Q)$(FLOTILLA) scenarios-accept
 
 ##@ Housekeeping
 .PHONY: setup setup-tests clean help
-setup: $(VENV)/.complete ## install what building needs
+setup: $(VENV)/.installed ## install what building needs
+
+# Ansible's plugins and the command `flotilla` find the packages of this checkout.
+$(VENV)/.installed: $(VENV)/.complete pyproject.toml
+	$(Q)$(VENV)/bin/pip install --quiet --no-index --no-deps --no-build-isolation --editable .
+	$(Q)touch $@
 
 setup-tests: setup ## install what testing needs
 	$(Q)images/install-host-packages tests/host-packages.txt
 
+uv_install = $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes
 $(VENV)/.complete: requirements.lock requirements-source.lock images/host-packages.txt
 	$(Q)images/install-host-packages images/host-packages.txt
 	$(Q)rm -rf $(VENV)
 	$(Q)python3 -m venv $(VENV)
-	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r requirements.lock
-	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --no-deps --no-build-isolation --use-pep517 \
-	    -r requirements-source.lock
+	@# pip brings uv alone: that installs all others in a quarter of pip's time.
+	$(Q)sed -n '/^uv==/,/[^\\]$$/p' requirements.lock >$(VENV)/uv.lock
+	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r $(VENV)/uv.lock
+	$(Q)$(uv_install) --only-binary :all: -r requirements.lock
+	$(Q)$(uv_install) --no-deps --no-build-isolation -r requirements-source.lock
 	$(Q)touch $@
 
 clean: ## remove all outputs; keys stay
 	$(Q)rm -rf $(BUILD)
 
 help: ## this list
-	@awk -F ':.*## ' '/^##@/ {printf "\n%s\n", substr($$0, 5)} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^##@/ {printf "\n%s\n", substr($$0, 5)} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2} \
+	    /^##= / {print "  " substr($$0, 5)}' $(MAKEFILE_LIST)
+
+##@ Variables of all targets
+##= MIRROR=           Debian mirror; by default the one of this computer's apt, if it is a Debian
+##= SECURITY_MIRROR=  the same for security updates
+##= SNAPSHOT=         snapshot archive for locked packages that left the mirror
+##= BUILD=            where outputs go instead of build/
+##= KEYS=             where keys are instead of ansible/keys/
+##= APPS=             where apps are instead of apps/
+##= V=1               show the commands
 
 # What somebody gave reaches a program as it stands, as one word or as several: no shell reads it as a command.
 quoted = '$(subst ','\'',$1)'
@@ -226,4 +302,4 @@ given = $(call quoted,$(value $1))
 each_given = $(foreach each,$(value $1),$(call quoted,$(each)))
 option = $(if $(value $2),$1 $(call given,$2))
 need = $(if $(value $1),$(call given,$1),$(error say which: make $@ $1=…))
-shell_scripts = git grep -l -E '^\#!/bin/(ba)?sh' -- images rootfs_overlay tests .ci
+shell_scripts = git grep -l -E '^\#!/bin/(ba)?sh' -- flotilla images lab rootfs_overlay tests .ci

@@ -17,6 +17,7 @@ Check as much as possible on a shared guest: each boot costs half a minute. Leav
 
 from __future__ import annotations
 
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -26,17 +27,25 @@ from typing import Any
 
 import pytest
 
-from images.builder import inventory, paths, qemu
+from flotilla.common import paths
+from flotilla.fleet import inventory
+from flotilla.fleet.model import Board, Fleet, Robot
 from images.builder.build import build, image_of
-from images.builder.fleet import Board, Fleet, Robot
-from tests.lab.guest import Guest
-from tests.lab.segment import Segment, station_address
-from tests.lab.ssh import Ssh
+from lab.qemu import qemu
+from lab.qemu.guest import Guest
+from lab.qemu.segment import Segment, station_address
+from lab.qemu.ssh import Ssh
 
-pytest_plugins = ["tests.lab.artefacts", "tests.lab.figures"]
+pytest_plugins = ["tests.artefacts", "tests.figures", "tests.tiers", "tests.costs"]
 
 BOOT_SECONDS = 300
 """Until the login prompt. Some 30 s on an idle host; the limit only has to be finite, and generous to a busy one."""
+
+
+def pytest_configure() -> None:
+    """Let SIGINT interrupt what tests start: a shell makes what it starts in the background ignore it, children too."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @dataclass(frozen=True)
@@ -62,7 +71,8 @@ GuestFactory = Callable[..., RobotGuest]
 """`guest(number)`: the robot's guest, booted, with SSH connected; `kernel=` for another than its board's.
 
 `fresh_guest` also takes the arguments of `Guest` (`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of
-`qemu.Options`), `segment=segment` to put it on a network with others, and `boot=False` to power it on oneself."""
+`qemu.Options`), `segment=segment` to put it on a network with others, `boot=False` to power it on oneself, and `image=`
+with a `label=` for another card."""
 
 
 @pytest.fixture(scope="session")
@@ -77,6 +87,12 @@ def flotilla_run() -> Path:
     done = subprocess.run(["make", "-C", str(paths.PROJECT), "runtime"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return paths.BUILD / "runtime" / "flotilla-run"
+
+
+@pytest.fixture(scope="session")
+def flotilla_slot(flotilla_run: Path) -> Path:
+    """The program of the boot state, built for this computer."""
+    return flotilla_run.with_name("flotilla-slot")
 
 
 @pytest.fixture(scope="session")
@@ -144,14 +160,15 @@ def _boot(
     boot: bool = True,
     segment: Segment | None = None,
     qemu_options: dict[str, Any] | None = None,
+    image: Path | None = None,
+    label: str = "",
     **arguments: Any,
 ) -> RobotGuest:
     robot = inventory.robot(fleet, number)
     board = fleet.boards[robot.board]
     if kernel and kernel != board.kernel:
         board, image = _with_kernel(fleet, robot, kernel)
-    else:
-        image = image_of(robot)
+    image = image or image_of(robot)
     if not image.exists():
         pytest.fail(f"{paths.shown(image)} is missing; build it: make image ROBOT={number}", pytrace=False)
     link: qemu.UserLink | qemu.Wire
@@ -160,7 +177,7 @@ def _boot(
     else:
         link = qemu.UserLink(subnet=fleet.network.subnet, guest=robot.address, station=station_address(fleet))
     options = qemu.Options(**{"name": robot.name, "mac": qemu.robot_mac(number), "link": link, **(qemu_options or {})})
-    machine = cleanup.enter_context(Guest(board, image, directory, options, **arguments))
+    machine = cleanup.enter_context(Guest(board, image, directory / label, options, **arguments))
     port = (lambda: segment.ssh_port(robot.address)) if segment else machine.ssh_port
     guest = RobotGuest(robot, board, image, machine, cleanup.enter_context(Ssh(robot, "127.0.0.1", port)))
     if boot:

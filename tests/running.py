@@ -15,10 +15,25 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.lab.ssh import Ssh
+from lab.qemu.ssh import Ssh
 
 PATIENCE = 60
 """Seconds, for what takes well under one: the machine may be busy."""
+
+DDS_ON_LOOPBACK = """
+<CycloneDDS><Domain Id="any">
+  <General>
+    <Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>
+    <AllowMulticast>false</AllowMulticast>
+  </General>
+  <Discovery>
+    <ParticipantIndex>auto</ParticipantIndex>
+    <MaxAutoParticipantIndex>4</MaxAutoParticipantIndex>
+    <Peers><Peer Address="127.0.0.1"/></Peers>
+  </Discovery>
+</Domain></CycloneDDS>
+"""
+"""Cyclone DDS's configuration without multicast."""
 
 Row = dict[str, Any]
 """What the watched signals are after a step; where all are of one block, by the names of its ports."""

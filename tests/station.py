@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import itertools
+import os
 import shutil
 import socket
 import struct
@@ -15,31 +17,42 @@ from pathlib import Path
 from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader, SeekingReader
 
-from images.builder import inventory, paths
-from runtime.station import telemetry
+from flotilla.common import paths
+from flotilla.fleet import inventory
+from flotilla.station import telemetry
 from tests.running import PATIENCE
 
-FLEET = paths.PROJECT / "tests" / "scenarios" / "inventory"
-ADDRESS = "127.0.0.254"
+FLEET = paths.PROJECT / "lab" / "scenarios" / "inventory"
+LOOPBACK = "127.{}.{}.".format(*divmod(256 + os.getpid() % 65024, 256))
+"""The fleet's addresses begin so: tests that run beside these have other ones, with the same ports."""
+
+ADDRESS = LOOPBACK + "254"
 """The station's in the fleet on loopback."""
+
+STRANGER = LOOPBACK + "9"
+"""No robot of that fleet."""
 
 Messages = list[tuple[str, Any]]
 """Topic and decoded message."""
 
 
-def on_loopback(directory: Path) -> Path:
-    """The scenarios' fleet on this computer's loopback, in an inventory that is made."""
+def on_loopback(directory: Path, begin: str = LOOPBACK) -> Path:
+    """The scenarios' fleet on this computer's loopback, in an inventory that is made; its addresses `begin` so."""
     shutil.copytree(FLEET, directory)
     for file in (directory / "robots.yml", directory / "group_vars" / "all.yml"):
-        file.write_text(file.read_text().replace("170.160.1.", "127.0.0."))
+        file.write_text(file.read_text().replace("170.160.1.", begin))
     return directory
 
 
 @contextmanager
-def station(fleet: Path, *options: str | Path, under: tuple[str, ...] = ()) -> Iterator[subprocess.Popen[str]]:
-    """The program with `options`, run by the command line `under`."""
-    argv = [*under, sys.executable, "-m", "runtime.station", *options, "--inventory", fleet, "--address", ADDRESS]
+def station(
+    fleet: Path, command: str, *options: str | Path, under: tuple[str, ...] = ()
+) -> Iterator[subprocess.Popen[str]]:
+    """`flotilla COMMAND` with `options`, run by the command line `under`."""
+    argv = [*under, sys.executable, "-m", "flotilla", command, *options, "--inventory", fleet, "--address", ADDRESS]
     with subprocess.Popen(
         argv, cwd=paths.PROJECT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -90,3 +103,27 @@ def steps(messages: Messages, topic: str) -> list[int]:
 
 def contiguous(numbers: list[int]) -> bool:
     return all(after == before + 1 for before, after in itertools.pairwise(numbers))
+
+
+def decoded(file: Path, *, whole: bool = True) -> Messages:
+    """All messages, decoded by the file's own schemas alone. A file that is not `whole` has no index and no end."""
+    data = io.BytesIO(file.read_bytes())
+    reader = SeekingReader(data, validate_crcs=True) if whole else NonSeekingReader(data, validate_crcs=True)
+    kinds: dict[int, type[Any]] = {}
+    found: Messages = []
+    try:
+        for schema, channel, message in reader.iter_messages(log_time_order=whole):  # which would wait for the end
+            assert schema is not None
+            if schema.id not in kinds:
+                kinds[schema.id] = message_class(schema.name, schema.data)
+            assert message.sequence == sum(topic == channel.topic for topic, _ in found)
+            found.append((channel.topic, kinds[schema.id].FromString(message.data)))
+    except EndOfFile:
+        assert not whole
+    return found
+
+
+def pymcap(command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """By a reader that shares nothing with the writer."""
+    argv = [str(Path(sys.executable).with_name("pymcap-cli")), command, *map(str, arguments)]
+    return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=PATIENCE)

@@ -15,6 +15,10 @@ import os
 import signal
 import subprocess
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # without an import: it takes time
+    from typing import Any
+
 ARGUMENTS = r"""<<INCLUDE_ANSIBLE_MODULE_JSON_ARGS>>"""
 RESTORE = """
 mount --bind / /mnt || exit
@@ -47,9 +51,24 @@ def remove(path: str) -> None:
         return  # something is left in it
 
 
+class RefusedError(Exception):
+    """A command that comes before the files has failed."""
+
+
+def run_first(command: dict[str, Any]) -> None:
+    """Run one of the commands that come before the files."""
+    stdin = base64.b64decode(command["stdin"])
+    done = subprocess.run(command["argv"], input=stdin, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip()
+        raise RefusedError(f"{command['name']}: {said or f'status {done.returncode}'}")
+
+
 def main() -> None:
     arguments = json.loads(ARGUMENTS)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    for command in arguments["before"]:
+        run_first(command)
     for path, file in arguments["write"].items():
         write(path, base64.b64decode(file["content"]), file["mode"])
     for path in arguments["remove"]:
@@ -67,5 +86,7 @@ if __name__ == "__main__":
         main()
     except (OSError, ValueError, KeyError) as error:
         print(json.dumps({"failed": True, "msg": f"{type(error).__name__}: {error}"}))
+    except RefusedError as error:
+        print(json.dumps({"failed": True, "msg": str(error)}))
     except subprocess.CalledProcessError as error:
         print(json.dumps({"failed": True, "msg": f"{error.cmd[2]}: {error.stderr.decode(errors='replace').strip()}"}))

@@ -24,11 +24,14 @@ import time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # without an import: it takes time
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from typing import Any
 
 ARGUMENTS = r"""<<INCLUDE_ANSIBLE_MODULE_JSON_ARGS>>"""
-LAYER = "/data/etc"
+APPS = "/data/apps"
+LISTINGS = "/etc/flotilla/apps"
+SYSTEM = "/etc/systemd/system"
+APP_SERVICE = "/usr/lib/systemd/system/flotilla-app@.service"
 SHOWN_BYTES = 65536
 LOOKED_AT_S = 1.0
 """At least, for overruns to show."""
@@ -45,6 +48,10 @@ def output(*argv: str) -> str:
 def read(path: str) -> str:
     with open(path) as file:
         return file.read()
+
+
+LAYER = "/data/B/etc" if "flotilla.slot=B" in read("/proc/cmdline").split() else "/data/A/etc"
+"""Above /etc: of the running slot's release."""
 
 
 class Root:
@@ -184,12 +191,69 @@ def firewall_is_loaded() -> bool:
     return output("nft", "-s", "list", "ruleset") == output("unshare", "--net", "sh", "-c", made)
 
 
-def units(tasks: list[str]) -> dict[str, dict[str, str]]:
-    """Services that start with the robot, control tasks among them, by name."""
+def app_unit(name: str) -> str:
+    return f"flotilla-app@{name}.service"
+
+
+def leads(link: str, where: str) -> bool:
+    return os.path.islink(link) and os.readlink(link) == where
+
+
+def names_in(directory: str) -> list[str]:
+    """What is in a directory and not hidden; nothing where there is none."""
+    return [name for name in (os.listdir(directory) if os.path.isdir(directory) else ()) if not name.startswith(".")]
+
+
+def apps(wanted: dict[str, Any], services: dict[str, dict[str, str]]) -> dict[str, dict[str, Any]]:
+    """By name, the apps that a robot has or should have.
+
+    Of each: `version` that is there, empty where none is; `listed`, the version that the inventory gave; whether it
+    starts with the robot (`kept`), its service has its `drop_in`, and it is `up`; `files`: what is wrong with those of
+    an app that the robot should have.
+    """
+    found = {}
+    for name in sorted({*wanted, *names_in(APPS), *names_in(LISTINGS)}):
+        place = os.path.join(APPS, name)
+        there = described(place)
+        is_link = there is not None and there.kind == stat.S_IFLNK and os.path.isdir(place)
+        listing = described(os.path.join(LISTINGS, name))
+        first = listing.content.decode(errors="replace").split("\n")[0].split() if listing else []
+        unit = services.get(app_unit(name))
+        found[name] = {
+            "version": os.readlink(place).partition("@")[2] if is_link else "",
+            "listed": first[1] if first[:1] == ["version"] and len(first) == 2 else "",
+            "kept": leads(os.path.join(SYSTEM, "multi-user.target.wants", app_unit(name)), APP_SERVICE),
+            "drop_in": leads(os.path.join(SYSTEM, f"{app_unit(name)}.d"), os.path.join(place, "unit.d")),
+            "up": unit is not None and is_up(unit),
+            "files": app_files(place, wanted[name]["files"]) if name in wanted and is_link else [],
+        }
+    return found
+
+
+def app_files(place: str, wanted: dict[str, dict[str, Any]]) -> list[str]:
+    """What is wrong with the files of an app."""
+    top = os.path.realpath(place)
+    found = []
+    for path in sorted({*wanted, *(os.path.relpath(each, top) for each in below(top))}):
+        there = described(os.path.join(top, path))
+        if path not in wanted:
+            found.append(f"{path} does not belong to it")
+        elif there is None:
+            found.append(f"{path} is missing")
+        elif there.kind != stat.S_IFREG or hashlib.sha256(there.content).hexdigest() != wanted[path]["sha256"]:
+            found.append(f"{path} has another content")
+        elif there.mode != wanted[path]["mode"] or there.owner != (0, 0):
+            found.append(f"{path} has mode {there.mode:o} and owner {there.owner[0]}")
+    return found
+
+
+def units(tasks: list[str], apps: Iterable[str] = ()) -> dict[str, dict[str, str]]:
+    """Services that start with the robot, by name. Of tasks and apps, those that are named, and tasks that run."""
     # What `systemctl list-unit-files` would say, which takes an old processor twenty seconds.
     wanted = glob.glob("/etc/systemd/system/*.wants/*.service")
     names = sorted({os.path.basename(path) for path in wanted if os.path.exists(path)})
-    names = [name for name in names if "@." not in name] + [f"flotilla-task@{task}.service" for task in tasks]
+    names = [name for name in names if "@." not in name and not name.startswith("flotilla-app@")]
+    names += [*(f"flotilla-task@{task}.service" for task in tasks), *map(app_unit, apps)]
     instances = "flotilla-task@*.service", "flotilla-ibss@*.service"
     running = output("systemctl", "list-units", "--plain", "--no-legend", "--all", *instances)
     names += [line.split()[0] for line in running.splitlines() if line.split()[0] not in names]
@@ -258,7 +322,7 @@ def lately(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     arguments = json.loads(ARGUMENTS)
-    services = units(arguments["control_tasks"])
+    services = units(arguments["control_tasks"], arguments["apps"])
     names = {name: re.findall("flotilla-task@(.+)[.]service$", name) for name in services}
     tasks = {name: task for name, found in names.items() for task in found}
     watch = Watch([task for name, task in tasks.items() if services[name]["ActiveState"] == "active"])
@@ -276,8 +340,11 @@ def main() -> None:
         "addresses": addresses,
         "firewall_is_loaded": firewall_is_loaded(),
         "sysctl": sysctl_drift(),
+        "apps": apps(arguments["apps"], services),
         "down": sorted(
-            name for name, unit in services.items() if not is_up(unit) and (name not in tasks or name in wanted)
+            name
+            for name, unit in services.items()
+            if not is_up(unit) and (name not in tasks or name in wanted) and not name.startswith("flotilla-app@")
         ),
         "superfluous_tasks": sorted(
             name for name in tasks.keys() - wanted if services[name]["ActiveState"] not in ("inactive", "failed")
@@ -287,6 +354,7 @@ def main() -> None:
             name: {key: services[name][key] for key in ("ActiveState", "SubState", "NRestarts")} for name in tasks
         },
         "clock": clock(),
+        "release": json.loads(output("flotilla-slot", "show") or "null"),
         "data_free_bytes": data.f_bavail * data.f_frsize,
         "boot_id": read("/proc/sys/kernel/random/boot_id").strip(),
     }

@@ -17,10 +17,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from images.builder import build, cache, paths, pool, progress, rootfs
-from images.builder.errors import UserError
-from images.builder.fleet import Fleet, Robot
-from images.builder.lock import SUITE, Lock, read_lock
+from flotilla.common import cache, paths, progress
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Fleet, Robot
+from images.builder import build, pool, rootfs
+from images.builder.lock import Lock, read_lock
 
 _PACKAGES = paths.PROJECT / "images" / "bench-packages.txt"
 _RUNS = 5
@@ -85,8 +86,8 @@ def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[R
 
     def image(*robots: Robot) -> Callable[[], int]:
         def make() -> int:
-            choice = ["--all"] if len(robots) == len(fleet.robots) else ["--robot", str(robots[0].number)]
-            _command([sys.executable, "-m", "images.builder", "image", *choice], BUILD=str(work), KEYS=str(paths.KEYS))
+            choice = ["--all"] if len(robots) == len(fleet.robots) else [str(robots[0].number)]
+            _command([sys.executable, "-m", "flotilla", "image", *choice], BUILD=str(work), KEYS=str(paths.KEYS))
             return sum(_allocated(images / build.image_of(robot).name) for robot in robots)
 
         return make
@@ -122,7 +123,7 @@ def _mmdebstrap(work: Path, repository: Path, lock: Lock) -> Row:
         *("mmdebstrap", "--quiet", "--variant=minbase", f"--architectures={lock.architecture}", f"--include={names}"),
         *(f"--dpkgopt=path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rules),
         "--hook-dir=/usr/share/mmdebstrap/hooks/merged-usr",
-        *(SUITE, str(out), f"deb [trusted=yes] copy://{repository} {SUITE} main"),
+        *(lock.release, str(out), f"deb [trusted=yes] copy://{repository} {lock.release} main"),
     ]
 
     def make() -> int:
@@ -146,7 +147,13 @@ def _mkosi(program: str, directory: Path, repository: Path, lock: Lock) -> Row:
     for each in ("workspace", "packages"):
         (directory / each).mkdir(parents=True)
     argv = [
-        *(program, f"--directory={directory}", "--build-sources=", "--distribution=debian", f"--release={SUITE}"),
+        *(
+            program,
+            f"--directory={directory}",
+            "--build-sources=",
+            "--distribution=debian",
+            f"--release={lock.release}",
+        ),
         *(f"--architecture={_MKOSI_ARCHITECTURES[lock.architecture]}", f"--local-mirror=file://{repository}"),
         *("--repository-key-check=no", "--bootable=no", "--with-docs=no", f"--source-date-epoch={lock.epoch}"),
         *("--format=tar", "--compress-output=zstd", "--output=root"),
@@ -183,8 +190,9 @@ def _allocated(path: Path) -> int:
 def _measure(work: str, made: str, make: Callable[[], int], runs: int) -> Row:
     seconds = []
     size = 0
-    with progress.step(work):
-        for _ in range(runs):
+    with progress.step(work) as step:
+        for run in range(runs):
+            step.at(run, runs, "runs")
             started = time.monotonic()
             size = make()
             seconds.append(time.monotonic() - started)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from images.builder.errors import UserError
-from images.builder.paths import shown
+from flotilla.common.errors import UserError
+from flotilla.common.paths import shown
 
 BLOCK = 4096
 

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from images.builder import (
-    bmap,
-    cache,
-    card,
-    host,
-    identity,
-    manifest,
-    namespace,
-    paths,
-    pool,
-    progress,
-    rootfs,
-    runtime,
-    tools,
-)
-from images.builder.errors import UserError
-from images.builder.fleet import Board, Fleet, Robot
-from images.builder.lock import Lock, read_lock
+from flotilla.common import cache, host, namespace, paths, progress
+from flotilla.common.errors import UserError
+from flotilla.fleet import identity, release_keys
+from flotilla.fleet.apps import BuiltApp
+from flotilla.fleet.model import Board, Fleet, Releases, Robot
+from images.builder import bmap, card, data_partition, manifest, pool, rootfs, runtime, slot, tools
+from images.builder.lock import Lock, board_lock, read_lock
 
 
 @dataclass(frozen=True)
@@ -36,6 +25,7 @@ class BoardBuild:
     tools_lock: Lock
     tools: tools.Tools
     root: Path
+    slot: Path
     base: Path
     manifest: Path
 
@@ -44,18 +34,28 @@ def image_of(robot: Robot, directory: Path = paths.IMAGES) -> Path:
     return directory / f"{robot.name}.img"
 
 
-def board_build(board: Board) -> BoardBuild:
-    """Everything up to the identity; from the cache where nothing changed."""
-    lock, tools_lock = read_lock(board.name), read_lock("tools")
+def board_build(board: Board, releases: Releases | None = None) -> BoardBuild:
+    """Everything up to the identity; from the cache where nothing changed. `releases`: who signs them."""
+    lock, tools_lock = board_lock(board), read_lock("tools")
     pool.fill([lock.without("kernel") if board.kernel == "lean" else lock, tools_lock])
     toolset = tools.Tools(tools.tree(tools_lock), lock.epoch)
     root = rootfs.build(board, lock, tools_lock)
-    base = card.base(board, root, toolset, lock.epoch)
-    return BoardBuild(board, lock, tools_lock, toolset, root, base, manifest.shared(board, lock, root, base, toolset))
+    content = slot.build(board, root, release_keys.document(releases or Releases()), slot.release())
+    base = card.base(board, content, toolset, lock.epoch)
+    described = manifest.shared(board, lock, root, content, base, toolset)
+    return BoardBuild(board, lock, tools_lock, toolset, root, content, base, described)
 
 
-def build(fleet: Fleet, robots: list[Robot], directory: Path = paths.IMAGES) -> list[Path]:
-    """Make the images of `robots` in `directory`; each is replaced only when it is complete."""
+def build(
+    fleet: Fleet,
+    robots: list[Robot],
+    directory: Path = paths.IMAGES,
+    apps: Mapping[str, Sequence[BuiltApp]] | None = None,
+) -> list[Path]:
+    """Make the images of `robots` in `directory`; each is replaced only when it is complete.
+
+    `apps`: those of each robot that has any, by its name, built for its board (flotilla.apps.assigned).
+    """
     host.check()
     namespace.check()
     with cache.exclusive():
@@ -63,8 +63,12 @@ def build(fleet: Fleet, robots: list[Robot], directory: Path = paths.IMAGES) -> 
         boards: dict[str, BoardBuild] = {}
         for robot in robots:
             if robot.board not in boards:
-                boards[robot.board] = board_build(fleet.boards[robot.board])
-        images = [_robot_image(fleet, robot, boards[robot.board], directory) for robot in robots]
+                boards[robot.board] = board_build(fleet.boards[robot.board], fleet.releases)
+        counted = [(robot, f", {n} of {len(robots)}" if len(robots) > 1 else "") for n, robot in enumerate(robots, 1)]
+        images = [
+            _robot_image(fleet, robot, boards[robot.board], directory, (apps or {}).get(robot.name, ()), count)
+            for robot, count in counted
+        ]
         for made in boards.values():
             if missing := made.lock.missing_suites:
                 print(missing_suites(made.lock.name, missing))
@@ -92,9 +96,20 @@ def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
         raise UserError("\n".join(problems))
 
 
-def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) -> Path:
-    """Hashing takes longest, and lets other threads work: the board's part is hashed while the robot's is made."""
-    started = time.monotonic()
+def _robot_image(
+    fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path, apps: Sequence[BuiltApp], count: str
+) -> Path:
+    with progress.step(f"card of {robot.name}{count}"):
+        what = _make_robot_image(fleet, robot, made, directory, apps)
+    print(what)
+    return image_of(robot, directory)
+
+
+def _make_robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path, apps: Sequence[BuiltApp]) -> str:
+    """Make it; what it is.
+
+    Hashing takes longest, and lets other threads work: the board's part is hashed while the robot's is made.
+    """
     final = image_of(robot, directory)
     work = directory / f".{robot.name}.part"
     cache.discard(work)
@@ -106,7 +121,7 @@ def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) 
             extents = card.begin(made.base, new)
             beginning = threads.submit(manifest.hash_range, new, 0, card.DATA.start)
             source = threads.submit(manifest.checkout)
-            nodes = identity.nodes(fleet, robot)
+            nodes = data_partition.nodes(fleet, robot, apps)
             data = work / "data.img"
             extents += card.complete(new, data, card.data_partition(made.tools, data, nodes, made.lock.epoch))
             data.unlink()
@@ -116,7 +131,7 @@ def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) 
             manifest.write(
                 fleet, robot, (made.lock, made.tools_lock), made.manifest, nodes=nodes, source=source.result(),
                 data=data_part, image=manifest.Part(name=final.name, bytes=card.SIZE, sha256=whole), extents=extents,
-                beside=new,
+                apps=apps, beside=new,
             )  # fmt: skip
             mapped = mapping.result().mapped
         new.with_suffix(".sha256").write_text(f"{whole}  {final.name}\n")
@@ -124,8 +139,4 @@ def _robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path) 
             made_file.rename(directory / made_file.name)
     finally:
         cache.discard(work)
-    print(
-        f"{paths.shown(final)}: {progress.size(card.SIZE)}, {progress.size(mapped)} to write, sha256 {whole[:16]}…, "
-        f"{time.monotonic() - started:.1f} s"
-    )
-    return final
+    return f"{paths.shown(final)}: {progress.size(card.SIZE)}, {progress.size(mapped)} to write, sha256 {whole[:16]}…"

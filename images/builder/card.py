@@ -1,16 +1,18 @@
-"""The card: MBR, GRUB, boot partition, root slots A and B, data partition. A file, made without loop device or mount.
+"""The card: MBR, GRUB, boot state, slots A and B, data partition. A file, made without loop device or mount.
 
 All cards of a board are the same up to the data partition: `base` makes that part once, `begin` copies it, `complete`
-adds a robot's data.
+adds a robot's data. What is in a slot, `slot.py` makes.
 
-| bytes from the start | what |
+| from | what |
 |---|---|
 | 0 | MBR: GRUB's boot.img, disk identifier, partition table |
-| 512 | GRUB's core image, with every module it needs, and its configuration |
-| 1 MiB | boot (ext2): environment block, kernel and initramfs of each slot |
-| 49 MiB | slot A (squashfs) |
-| 209 MiB | slot B (empty until the first update) |
-| 369 MiB | data (ext4): the robot's identity, then all that changes; grows to the card on first boot |
+| 512 bytes | GRUB's core image, with every module it needs, and its configuration |
+| 4 MiB | boot state, raw: tries, and two copies of the state, 4 MiB from each other (runtime/programs/boot_state.h) |
+| then | slot A |
+| then | slot B (empty until the first update) |
+| then | data (ext4): the robot's identity, then all that changes; grows to the card on first boot |
+
+`images/boot/card.yml` says the identifier and the sizes.
 """
 
 from __future__ import annotations
@@ -20,24 +22,47 @@ import json
 import os
 import struct
 import tarfile
+import zlib
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
+from typing import Annotated
 
-from images.builder import cache, filesystem, paths
-from images.builder.errors import UserError
+import pydantic
+
+from flotilla.common import cache, paths, yaml_file
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Board, Integer, between
+from images.builder import environment_block, filesystem
 from images.builder.filesystem import Node
-from images.builder.fleet import Board
 from images.builder.tools import Tools
 
 MIB = 1 << 20
-DISK_ID = 0x464C4F54
-"""MBR identifier of every card. One per card is in a robot, so it needs no more to be found by."""
 _GRUB_MODULES = """
-    biosdisk part_msdos ext2 memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot
+    biosdisk part_msdos memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot
     iorw
 """
-_GRUB_TEMPLATE = paths.PROJECT / "images" / "grub.cfg.j2"
-_UUIDS = {"boot": "5b0e4a3c-6f1d-4c58-9d0a-000000000001", "data": "5b0e4a3c-6f1d-4c58-9d0a-000000000004"}
+_GRUB_TEMPLATE = paths.PROJECT / "images" / "boot" / "grub.cfg.j2"
+_LAYOUT = paths.PROJECT / "images" / "boot" / "card.yml"
+_DATA_UUID = "5b0e4a3c-6f1d-4c58-9d0a-000000000004"
+
+
+class Layout(pydantic.BaseModel):
+    """What card.yml says."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    layout: Annotated[
+        Integer, between(1, 1000, "a number that rises with each change of the card that an update cannot make")
+    ]
+    """Number of the layout. A robot takes updates for its own only."""
+    disk_id: Annotated[Integer, between(1, 0xFFFFFFFF, "four bytes, of which no other disk in a robot has the same")]
+    """MBR identifier of every card."""
+    slot_mib: Annotated[Integer, between(32, 16384, unit="MiB")]
+    """Size of each of the two slots."""
+    data_mib: Annotated[Integer, between(8, 16384, unit="MiB")]
+    """Size of the data partition in the image. The first boot extends it to the end of the card."""
+
+
+LAYOUT = yaml_file.read(_LAYOUT, Layout)
 
 
 @dataclass(frozen=True)
@@ -51,21 +76,36 @@ class Partition:
 
     @property
     def partuuid(self) -> str:
-        return f"{DISK_ID:08x}-{self.number:02}"
+        return f"{LAYOUT.disk_id:08x}-{self.number:02}"
+
+    @property
+    def end(self) -> int:
+        return self.start + self.size
 
 
-BOOT = Partition(1, "boot", 1 * MIB, 48 * MIB)
-SLOTS = [Partition(2, "A", 49 * MIB, 160 * MIB), Partition(3, "B", 209 * MIB, 160 * MIB)]
-DATA = Partition(4, "data", 369 * MIB, 32 * MIB)
-SIZE = DATA.start + DATA.size
+REGION = 4 * MIB
+"""Each block of the boot state has a region of its own: flash may lose what lies beside a sector that it writes."""
+STATE = Partition(1, "state", REGION, 3 * REGION)
+_A = Partition(2, "A", STATE.end, LAYOUT.slot_mib * MIB)
+SLOTS = [_A, Partition(3, "B", _A.end, LAYOUT.slot_mib * MIB)]
+DATA = Partition(4, "data", SLOTS[-1].end, LAYOUT.data_mib * MIB)
+SIZE = DATA.end
+
+SECTOR = 512
+TRIES = SECTOR
+"""Where the tries lie in the partition `STATE`: behind a tar header, by which GRUB finds the sector to write."""
+COPIES = [REGION, 2 * REGION]
+"""Where the copies of the state lie in it."""
 
 COMMON_ARGUMENTS = ["ro", "rootfstype=squashfs", "init=/usr/lib/flotilla/preinit", "net.ifnames=0", "panic=10",
                     "cpufreq.default_governor=performance", "cryptomgr.notests", "noisapnp", "quiet"]  # fmt: skip
 """Kernel command line of every card; the board adds its own. The kernel's self-tests of its ciphers take two seconds of
 each boot under emulation, and more on the board; to look for ISA cards without jumpers, a third of one."""
 
-ENVIRONMENT_BLOCK = b"# GRUB Environment Block\nORDER=A B\nA_OK=1\nA_TRY=0\nB_OK=0\nB_TRY=0\n".ljust(1024, b"#")
-"""What GRUB and the running system tell each other about the slots, as on a new card: A is good, B is empty."""
+HEADER_ROOM = 4096
+"""Before a slot's end: there its header begins."""
+_TYPES = {"state": 0xDA, "A": 0x83, "B": 0x83, "data": 0x83}
+"""Of partitions, in the MBR: 0xDA is data without a file system."""
 
 Extents = list[tuple[int, int]]
 """Byte ranges (offset, length) of a card that hold anything."""
@@ -79,40 +119,54 @@ def kernel_arguments(board: Board) -> list[str]:
     return [*COMMON_ARGUMENTS, *board.kernel_arguments, *own, "console=tty0", console]
 
 
-def base(board: Board, root: Path, tools: Tools, epoch: int) -> Path:
-    """Directory with `card.img`, everything but the data partition, and `extents.json`."""
+def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
+    """Directory with `card.img`, everything but the data partition, and `extents.json`.
+
+    `slot`: what `slot.build` made, for slot A.
+    """
     key = cache.digest(
-        root.name, tools.directory.name, str(epoch), board.model_dump_json(), _GRUB_TEMPLATE, Path(__file__),
-        Path(filesystem.__file__),
+        slot.name, tools.directory.name, str(epoch), board.model_dump_json(), _GRUB_TEMPLATE, _LAYOUT, Path(__file__),
+        Path(filesystem.__file__), Path(environment_block.__file__),
     )  # fmt: skip
 
     def make(out: Path) -> None:
-        squashfs = root / "root.squashfs"
-        if squashfs.stat().st_size > SLOTS[0].size:
-            raise UserError(
-                f"the root file system of {board.name} is {squashfs.stat().st_size} bytes, a slot {SLOTS[0].size}: "
-                "leave out packages in images/packages/ or files in images/rootfs/exclude.list"
-            )
-        boot = out / "boot.img"
-        kernel = [root / name for name in ("vmlinuz", "initrd.img") if (root / name).exists()]
-        config = grub_config(board, initramfs=len(kernel) > 1)
-        boot_extents = filesystem.make(
-            tools, boot, BOOT.size, _boot_nodes(kernel), kind="ext2", label="boot", uuid=_UUIDS["boot"],
-            epoch=epoch,
-        )  # fmt: skip
-        core = grub_core(board, tools, out, config)
+        core = grub_core(board, tools, out, grub_config(board))
+        content, header = slot / "slot.img", (slot / "header").read_bytes()
+        blocks = [(STATE.start, tries_block())] + [(STATE.start + place, state_copy()) for place in COPIES]
+        blocks += [
+            (SLOTS[0].end - HEADER_ROOM, header),
+            (SLOTS[1].end - HEADER_ROOM, bytes(HEADER_ROOM)),
+            (0, _boot_sector(tools)),
+            (SECTOR, core),
+        ]
         with (out / "card.img").open("wb") as card:
             card.truncate(SIZE)
-            card.write(_boot_sector(tools))
-            card.seek(512)
-            card.write(core)
-            copied = [(0, 512 + len(core))]
-            copied += _place(boot, boot_extents, card.fileno(), BOOT)
-            copied += _place(squashfs, [(0, squashfs.stat().st_size)], card.fileno(), SLOTS[0])
-        (out / "extents.json").write_text(json.dumps(copied))
-        boot.unlink()
+            copied = _place(content, [(0, content.stat().st_size)], card.fileno(), SLOTS[0])
+            for place, block in blocks:
+                card.seek(place)
+                card.write(block)
+        copied += [(place, -(-len(block) // SECTOR) * SECTOR) for place, block in blocks]
+        (out / "extents.json").write_text(json.dumps(sorted(copied)))
 
     return cache.result("card", key, make)
+
+
+def tries_block() -> bytes:
+    """The first sectors of the boot state: a tar header (POSIX.1-1988, ustar), and behind it no tries."""
+    header = bytearray(SECTOR)
+    fields = {0: "tries", 100: "0000644", 108: "0000000", 116: "0000000", 124: f"{SECTOR:011o}", 136: "0" * 11,
+              148: " " * 8, 156: "0", 257: "ustar", 263: "00"}  # fmt: skip
+    for place, text in fields.items():
+        header[place : place + len(text)] = text.encode()
+    header[148:155] = f"{sum(header):06o}\0".encode()
+    return bytes(header) + environment_block.make({"FOR": "0"}, SECTOR)
+
+
+def state_copy(sequence: int = 1, *, order: str = "A B", good: str = "A", trial: str = "") -> bytes:
+    """A copy of the state as flotilla-slot writes it; that of a new card: A is good, B is empty."""
+    lines = {"SEQ": str(sequence), "ORDER": order, "A_OK": str(int("A" in good)), "B_OK": str(int("B" in good))}
+    body = environment_block.lines(lines | {"TRIAL": trial})
+    return environment_block.of(body + f"CRC={zlib.crc32(body.encode()):08x}\nEND={sequence}\n", SECTOR)
 
 
 def extents(base_directory: Path) -> Extents:
@@ -141,7 +195,7 @@ def complete(card: Path, data: Path, data_extents: Extents) -> Extents:
 
 def data_partition(tools: Tools, out: Path, nodes: list[Node], epoch: int) -> Extents:
     """Write the data partition `out` with the robot's files."""
-    return filesystem.make(tools, out, DATA.size, nodes, kind="ext4", label="data", uuid=_UUIDS["data"], epoch=epoch)
+    return filesystem.make(tools, out, DATA.size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch)
 
 
 def _place(source: Path, extents: Extents, card: int, partition: Partition) -> Extents:
@@ -157,7 +211,7 @@ def _place(source: Path, extents: Extents, card: int, partition: Partition) -> E
     return [(partition.start + start, length) for start, length in extents]
 
 
-def grub_config(board: Board, *, initramfs: bool) -> bytes:
+def grub_config(board: Board) -> bytes:
     """What GRUB does on a card of the board."""
     import jinja2  # here, because the next robot's card does not need it
 
@@ -169,19 +223,14 @@ def grub_config(board: Board, *, initramfs: bool) -> bytes:
         autoescape=False,
     )
     text: str = environment.from_string(_GRUB_TEMPLATE.read_text()).render(
-        board=board, slots=SLOTS, kernel_arguments=kernel_arguments(board), initramfs=initramfs
+        board=board,
+        slots=SLOTS,
+        state_partition=STATE,
+        tries=TRIES // SECTOR,
+        copies=[place // SECTOR for place in COPIES],
+        header_of=lambda slot: (slot.size - HEADER_ROOM) // SECTOR,
     )
     return text.encode()
-
-
-def _boot_nodes(kernel: list[Path]) -> list[Node]:
-    return [
-        Node(PurePosixPath("/grub")),
-        Node(PurePosixPath("/grub/grubenv"), ENVIRONMENT_BLOCK, 0o644),
-        Node(PurePosixPath("/A")),
-        *(Node(PurePosixPath("/A") / file.name, file.read_bytes(), 0o644) for file in kernel),
-        Node(PurePosixPath("/B")),
-    ]
 
 
 def grub_core(board: Board, tools: Tools, out: Path, config: bytes) -> bytes:
@@ -200,13 +249,13 @@ def grub_core(board: Board, tools: Tools, out: Path, config: bytes) -> bytes:
     modules = tools.directory / "usr/lib/grub/i386-pc"
     tools.run(
         "usr/bin/grub-mkimage", "-O", "i386-pc", "-d", modules, "-c", begin,
-        "-m", inside, "-p", "(,msdos1)/grub",  # in this order: a memdisk moves the prefix into itself
+        "-m", inside, "-p", "(memdisk)",  # in this order: a memdisk moves the prefix into itself
         "-o", core, *_GRUB_MODULES.split(),
     )  # fmt: skip
     content = core.read_bytes()
     for file in (core, begin, inside):
         file.unlink()
-    if len(content) > BOOT.start - 512:
+    if len(content) > STATE.start - SECTOR:
         raise UserError(f"GRUB's core image of {len(content)} bytes does not fit before the first partition")
     return content
 
@@ -215,8 +264,10 @@ def _boot_sector(tools: Tools) -> bytes:
     """MBR: GRUB's first stage (it loads sector 1 on), the identifier, and four partitions by LBA."""
     code = (tools.directory / "usr/lib/grub/i386-pc/boot.img").read_bytes()[:440]
     entries = b""
-    for partition in (BOOT, *SLOTS, DATA):
-        status = 0x80 if partition is BOOT else 0
+    for partition in (STATE, *SLOTS, DATA):
+        status = 0x80 if partition is STATE else 0
         chs = b"\xfe\xff\xff"  # beyond what CHS can say: LBA counts
-        entries += struct.pack("<B3sB3sII", status, chs, 0x83, chs, partition.start // 512, partition.size // 512)
-    return code + struct.pack("<IH", DISK_ID, 0) + entries + b"\x55\xaa"
+        entries += struct.pack(
+            "<B3sB3sII", status, chs, _TYPES[partition.name], chs, partition.start // 512, partition.size // 512
+        )
+    return code + struct.pack("<IH", LAYOUT.disk_id, 0) + entries + b"\x55\xaa"

@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from images.builder import namespace
+from flotilla.common import namespace
 
 DEVICES = ("null", "zero", "full", "random", "urandom", "tty")
 

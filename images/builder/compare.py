@@ -30,11 +30,11 @@ class Part:
 
 PARTS = (
     Part("MBR", 0, 512),
-    Part("GRUB's core image", 512, card.BOOT.start),
+    Part("GRUB's core image", 512, card.STATE.start),
     *(
         Part(name, partition.start, partition.start + partition.size)
         for name, partition in (
-            ("boot partition", card.BOOT),
+            ("boot state", card.STATE),
             *((f"slot {slot.name}", slot) for slot in card.SLOTS),
             ("data partition", card.DATA),
         )

@@ -18,7 +18,7 @@ import lz4
 import lz4.block
 from elftools.elf.elffile import ELFFile
 
-from images.builder.errors import UserError
+from flotilla.common.errors import UserError
 
 _SETUP_SECTS, _SYSSIZE, _MAGIC = 0x1F1, 0x1F4, 0x202
 _RELOCATABLE, _PAYLOAD, _INIT_SIZE = 0x234, 0x248, 0x260

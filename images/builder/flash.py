@@ -22,10 +22,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from images.builder import progress
+from flotilla.common import progress
+from flotilla.common.errors import UserError
+from flotilla.common.paths import shown
 from images.builder.bmap import BLOCK, BlockMap, Range, bmap_of, read_bmap
-from images.builder.errors import UserError
-from images.builder.paths import shown
 
 CHUNK = 1 << 20
 _DIRTY_LIMIT = 8 << 20
@@ -573,7 +573,7 @@ def _verify(bmap: BlockMap, target: Target) -> None:
 
 
 class _Meter:
-    """Bytes done as a line of progress: share, rate, time left."""
+    """Bytes done as a line of progress: share and rate."""
 
     def __init__(self, step: progress.Step, total: int) -> None:
         self._step = step
@@ -584,8 +584,8 @@ class _Meter:
     def add(self, count: int) -> None:
         self._done += count
         rate = self._done / max(time.monotonic() - self._started, 1e-6)
-        left = (self._total - self._done) / rate
-        self._step.at(self._done >> 20, self._total >> 20, f"MiB, {rate / 1e6:.1f} MB/s, {left:.0f} s left")
+        self._step.at(self._done >> 20, self._total >> 20, "MiB")
+        self._step.note(f"{rate / 1e6:.1f} MB/s")
 
 
 def _next_steps(target: Target, bmap: BlockMap, robot: str) -> str:

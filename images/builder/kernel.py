@@ -1,6 +1,6 @@
 """Kernels of our own: Debian's packaged source, configured by the fragments in `kernel/`, built by the locked compiler.
 
-`kernel/kernels.yml` says which fragments make which kernel. Whatever no fragment asks for is off; whatever one asks for
+`kernel/NAME.yml` says which fragments make the kernel NAME. Whatever no fragment asks for is off; whatever one asks for
 must be in the final configuration, or the build fails and says why: kconfig itself drops an option silently when
 something that it depends on is missing.
 """
@@ -15,35 +15,40 @@ import re
 import shutil
 import subprocess
 import tarfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import pydantic
-import yaml
 
-from images.builder import cache, host, kernel_stage, namespace, paths, pool, progress, tools
-from images.builder.errors import Problem, ProblemsError, UserError
+from flotilla.common import cache, host, namespace, paths, progress, yaml_file
+from flotilla.common.errors import Problem, ProblemsError, UserError
+from flotilla.fleet.model import Architecture, Board
+from images.builder import kernel_stage, pool, tools
 from images.builder.lock import Package, read_lock
 
-DIRECTORY = paths.PROJECT / "kernel"
 _SOURCE = re.compile(r"linux-source-[0-9.]+")
 _SPACE = 4 << 30
 """Bytes of disk for the source and its objects."""
 
 
+MINUTES = 7
+"""Of two cores for a kernel with its modules, about: what is said before one is built."""
+
+
 class Recipe(pydantic.BaseModel):
-    """One kernel: an entry of kernels.yml."""
+    """One kernel: what its file in `kernel/` says."""
 
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-    architecture: Literal["i386", "amd64"]
-    """Debian's name of the architecture."""
+    architecture: Architecture
+    """Debian's name of the processor architecture."""
     fragments: tuple[str, ...]
-    """Names of files in `kernel/fragments/`, without `.config`."""
+    """Names of files in `kernel/fragments/`, without `.config`. No two set an option differently."""
     modules: bool = True
-    """Whether its modules are built and packaged. The kernel itself is the same without them."""
+    """`false`: leave the modules out. The kernel itself is the same without them."""
+    files: int = pydantic.Field(gt=0)
+    """About how many are compiled: by them a build shows how far it is."""
 
 
 @dataclass(frozen=True)
@@ -96,20 +101,28 @@ class Kernel:
         return str(json.loads((self.directory / "kernel.json").read_text())["release"])
 
 
-def recipes(path: Path = DIRECTORY / "kernels.yml") -> dict[str, Recipe]:
-    """All kernels, by name."""
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return pydantic.TypeAdapter(dict[str, Recipe]).validate_python(content)
-    except (yaml.YAMLError, pydantic.ValidationError) as error:
-        raise UserError(f"{paths.shown(path)}: {error}") from None
+def names() -> list[str]:
+    """All kernels."""
+    return sorted(path.stem for path in paths.KERNELS.glob("*.yml"))
 
 
 def recipe(name: str) -> Recipe:
-    known = recipes()
-    if name not in known:
-        raise UserError(f"kernel/kernels.yml: no kernel '{name}'; there are {', '.join(known)}")
-    return known[name]
+    """What makes a kernel."""
+    if name not in names():
+        file = paths.shown(paths.KERNELS / f"{name}.yml")
+        raise UserError(f"{file}: there is no such kernel; there are {', '.join(names())}")
+    return yaml_file.read(paths.KERNELS / f"{name}.yml", Recipe)
+
+
+def board_kernel(board: Board) -> Kernel:
+    """Our own kernel for a board: that of its name."""
+    architecture = recipe(board.name).architecture
+    if architecture != board.architecture:
+        raise UserError(
+            f"{paths.shown(paths.KERNELS / f'{board.name}.yml')}: architecture: {architecture}: the board's is "
+            f"{board.architecture}; make them the same here or in group_vars/board_{board.name}.yml"
+        )
+    return build(board.name)
 
 
 # --- fragments ---
@@ -160,7 +173,7 @@ def wanted(name: str) -> dict[str, Option]:
     return merge(
         option
         for fragment in recipe(name).fragments
-        for option in read_fragment(DIRECTORY / "fragments" / f"{fragment}.config")
+        for option in read_fragment(paths.KERNELS / "fragments" / f"{fragment}.config")
     )
 
 
@@ -223,11 +236,7 @@ def build(name: str) -> Kernel:
     options = wanted(name)
     lock = read_lock("toolchain")
     origin = source(lock.packages)
-    made_by = [Path(kernel_stage.__file__), Path(kernel_stage.__file__).with_name("chroot.py")]
     modules = recipe(name).modules
-    key = cache.digest(
-        lock.digest, recipe(name).architecture, request(options.values()), f"modules {modules}", *made_by
-    )
 
     def make(out: Path) -> None:
         free = shutil.disk_usage(paths.BUILD).free
@@ -249,18 +258,38 @@ def build(name: str) -> Kernel:
         problems = compare(options.values(), (out / "config").read_text(), (out / "kconfig").read_text())
         if problems:
             raise ProblemsError(problems)
-        with progress.step(f"kernel {name}") as step:
-            _run(stage, "build", log, lambda: step.note(f"{_compiled(log)} files compiled"))
+        with progress.step(f"kernel {name}", lambda: far(progress.text(log), recipe(name).files)):
+            _run(stage, "build", log)
 
-    return Kernel(cache.result("kernel", key, make))
-
-
-def _run(stage: kernel_stage.Description, what: str, log: Path, watch: Callable[[], object] | None = None) -> None:
-    namespace.run_stage(kernel_stage.__name__, [what, json.dumps(stage.__dict__)], log, watch)
+    return Kernel(cache.result("kernel", key(name), make))
 
 
-def _compiled(log: Path) -> int:
-    return sum(line.startswith("  CC") for line in log.read_text(errors="replace").splitlines())
+def key(name: str) -> str:
+    """Hash of all that decides a kernel's bytes."""
+    lock = read_lock("toolchain")
+    made_by = [Path(kernel_stage.__file__), Path(kernel_stage.__file__).with_name("chroot.py")]
+    made_of = recipe(name)
+    options = request(wanted(name).values())
+    return cache.digest(lock.digest, made_of.architecture, options, f"modules {made_of.modules}", *made_by)
+
+
+def unbuilt(names: Iterable[str]) -> list[str]:
+    """Those of these kernels that the cache lacks, which take minutes to build."""
+    return [name for name in names if not cache.has("kernel", key(name))]
+
+
+def far(log: str, files: int) -> progress.Far:
+    """How far a build is that has written `log`."""
+    return progress.Far(sum(line.startswith("  CC") for line in log.splitlines()), files, "files compiled")
+
+
+def how_long(names: Sequence[str]) -> str:
+    """What is said before kernels are built."""
+    return f"kernels to build first: {', '.join(names)}, each about {MINUTES} minutes on two cores"
+
+
+def _run(stage: kernel_stage.Description, what: str, log: Path) -> None:
+    namespace.run_stage(kernel_stage.__name__, [what, json.dumps(stage.__dict__)], log)
 
 
 def report(names: Sequence[str]) -> str:
@@ -268,6 +297,8 @@ def report(names: Sequence[str]) -> str:
     lines = []
     host.check()
     namespace.check()
+    if missing := unbuilt(names):
+        progress.say(how_long(missing))
     with cache.locked(paths.CACHE / ".kernels.lock"):
         for name in names:
             package = build(name).package

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import subprocess
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Literal, get_args
 from urllib.parse import unquote
 
-from images.builder import mirror, paths, progress
-from images.builder.errors import UserError
+import pydantic
+
+from flotilla.common import paths, progress, yaml_file
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Architecture, Board, Word
+from images.builder import mirror
 from images.builder.mirror import DEBIAN, SECURITY, Mirrors
 
-SUITE = "bookworm"
-"""The last Debian with i386 kernels."""
-_SUITES = ((DEBIAN, SUITE), (DEBIAN, f"{SUITE}-updates"), (SECURITY, f"{SUITE}-security"))
 _COMPONENTS = "main non-free-firmware"
 _KEYRINGS = tuple(Path("/usr/share/keyrings", f"debian-archive-keyring.{suffix}") for suffix in ("gpg", "pgp"))
 _DATE = "%Y-%m-%dT%H:%M:%SZ"
@@ -31,27 +32,52 @@ Role = Literal["required", "userland", "kernel"]
 """`required`: Essential, or of that priority in the archive's index; `kernel`: not installed with its dependencies."""
 
 
+class _Asked(pydantic.BaseModel):
+    """A lock in locks.yml."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    architecture: Architecture
+    """Debian's name of the processor architecture."""
+    list: str = ""
+    """Name of its package list. The lock's own name, when left out."""
+
+
+class File(pydantic.BaseModel):
+    """What locks.yml says."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    suite: Word
+    """Debian's name of the release that all packages are of."""
+    locks: dict[str, _Asked]
+    """Locks of other things than boards, by name."""
+
+
 @dataclass(frozen=True)
-class _Recipe:
+class Recipe:
     """How a lock comes about."""
 
+    suite: str
     architecture: str
     lists: tuple[str, ...]
     system: bool = True
-    """Whether it is a system to bootstrap, which needs what is essential or required, and apt."""
+    """Whether it is a system to bootstrap, which needs what is essential or required, apt, and a kernel."""
 
 
-_RECIPES = {
-    "smartcoret3": _Recipe("i386", ("robot", "smartcoret3")),
-    "x86_64": _Recipe("amd64", ("robot", "x86_64")),
-    "tools": _Recipe("amd64", ("tools",), system=False),
-    "toolchain": _Recipe("amd64", ("toolchain",), system=False),
-    "runtime-i386": _Recipe("i386", ("runtime",), system=False),
-    "runtime-amd64": _Recipe("amd64", ("runtime",), system=False),
-    "verify": _Recipe("i386", ("verify",), system=False),
-    "emulator": _Recipe("amd64", ("emulator",), system=False),
-}
-NAMES = tuple(_RECIPES)
+def recipes(boards: Iterable[Board]) -> dict[str, Recipe]:
+    """Of all locks by name: the boards', and those of locks.yml."""
+    path = paths.PACKAGES / "locks.yml"
+    file = yaml_file.read(path, File)
+    found = {board.name: Recipe(file.suite, board.architecture, ("robot", board.name)) for board in boards}
+    for name, asked in file.locks.items():
+        if name in found:
+            raise UserError(f"{paths.shown(path)}: locks.{name}: is a board's name, too; give one of them another")
+        found[name] = Recipe(file.suite, asked.architecture, (asked.list or name,), system=False)
+    return found
+
+
+def suites(release: str) -> tuple[tuple[str, str], ...]:
+    """Archive and name of a release and of what belongs to it."""
+    return (DEBIAN, release), (DEBIAN, f"{release}-updates"), (SECURITY, f"{release}-security")
 
 
 @dataclass(frozen=True, order=True)
@@ -88,6 +114,13 @@ class Lock:
     architecture: str
     suites: tuple[Suite, ...]
     packages: tuple[Package, ...]
+    checked: datetime | None = None
+    """Release of the newest suite by which `make lock` last found the packages unchanged, UTC; None: it never did."""
+
+    @property
+    def current(self) -> datetime:
+        """Release of the newest suite up to which the packages are known to be the archive's own."""
+        return max([*(suite.date for suite in self.suites), *([self.checked] if self.checked else [])])
 
     @property
     def epoch(self) -> int:
@@ -96,8 +129,8 @@ class Lock:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the lock's text: names whatever is made from it."""
-        return hashlib.sha256(format_lock(self).encode()).hexdigest()
+        """SHA-256 of the lock's text but for `checked`: names whatever is made from it."""
+        return hashlib.sha256(format_lock(dataclasses.replace(self, checked=None)).encode()).hexdigest()
 
     def date(self, archive: str) -> datetime:
         """When an archive's newest suite was released."""
@@ -107,7 +140,12 @@ class Lock:
     def missing_suites(self) -> tuple[str, ...]:
         """Suites that it was made without, as no signature covered what the mirror had of them."""
         there = {suite.name for suite in self.suites}
-        return tuple(name for _, name in _SUITES if name not in there)
+        return tuple(name for _, name in suites(self.release) if name not in there)
+
+    @property
+    def release(self) -> str:
+        """Debian's name of the release that it is of."""
+        return min((suite.name for suite in self.suites if suite.archive == DEBIAN), key=len)
 
     def without(self, role: Role) -> Lock:
         """The lock but for the packages of one role."""
@@ -119,7 +157,7 @@ class Lock:
 
 
 @dataclass(frozen=True)
-class Wish:
+class PackageRequest:
     """One line of a package list."""
 
     package: str
@@ -151,14 +189,26 @@ def read_lock(name: str) -> Lock:
     """The lock of a board, or of the build tools."""
     path = lock_file(name)
     if not path.is_file():
-        raise UserError(f"{paths.shown(path)}: missing; `make lock` writes the locks of {', '.join(NAMES)}")
+        raise UserError(f"{paths.shown(path)}: missing; `make lock ONLY={name}` writes it")
     return parse_lock(path.read_text(encoding="utf-8"), name, paths.shown(path))
+
+
+def board_lock(board: Board) -> Lock:
+    """The lock of a board."""
+    lock = read_lock(board.name)
+    if lock.architecture != board.architecture:
+        raise UserError(
+            f"{paths.shown(lock_file(board.name))}: architecture: {lock.architecture}: the board's is "
+            f"{board.architecture}; run `make lock ONLY={board.name}`"
+        )
+    return lock
 
 
 def parse_lock(text: str, name: str, shown: str) -> Lock:
     """The lock that `text` describes; `shown` names the file in errors."""
     architecture = ""
     suites: list[Suite] = []
+    checked: datetime | None = None
     packages: dict[str, Package] = {}
     for number, line in enumerate(text.splitlines(), 1):
         try:
@@ -168,8 +218,9 @@ def parse_lock(text: str, name: str, shown: str) -> Lock:
                 case ["architecture", value]:
                     architecture = _valid("architecture", value)
                 case ["suite", archive, suite, date]:
-                    when = datetime.strptime(date, _DATE).replace(tzinfo=UTC)
-                    suites.append(Suite(_valid("archive", archive), suite, when))
+                    suites.append(Suite(_valid("archive", archive), suite, _time(date)))
+                case ["checked", date]:
+                    checked = _time(date)
                 case ["package", *values]:
                     package = _package(values)
                     if package.name in packages:
@@ -178,20 +229,26 @@ def parse_lock(text: str, name: str, shown: str) -> Lock:
                 case _:
                     raise ValueError(f"'{line}' is no architecture, suite or package")
         except ValueError as error:
-            raise UserError(f"{shown}:{number}: {error}; mend the line or run `make lock`") from None
-    for what, present in (("architecture", architecture), ("suite", suites), ("package", packages)):
+            raise UserError(f"{shown}:{number}: {error}; repair the line or run `make lock`") from None
+    of_debian = [suite for suite in suites if suite.archive == DEBIAN]
+    for what, present in (("architecture", architecture), (f"suite {DEBIAN}", of_debian), ("package", packages)):
         if not present:
             raise UserError(f"{shown}: has no {what} line; restore it from git or run `make lock`")
-    return Lock(name, architecture, tuple(sorted(suites)), tuple(sorted(packages.values())))
+    return Lock(name, architecture, tuple(sorted(suites)), tuple(sorted(packages.values())), checked)
 
 
 def format_lock(lock: Lock) -> str:
     """The text of a lock: one package a line, so that a change reads well in git."""
     lines = [_HEADER, f"architecture {lock.architecture}"]
     lines += [f"suite {suite.archive} {suite.name} {suite.date.strftime(_DATE)}" for suite in sorted(lock.suites)]
+    lines += [f"checked {lock.checked.strftime(_DATE)}"] if lock.checked else []
     lines += ["", f"# package {' '.join(_COLUMNS)}"]
     lines += [f"package {' '.join(map(str, dataclasses.astuple(package)))}" for package in sorted(lock.packages)]
     return "\n".join(lines) + "\n"
+
+
+def _time(text: str) -> datetime:
+    return datetime.strptime(text, _DATE).replace(tzinfo=UTC)
 
 
 def _valid(column: str, value: str) -> str:
@@ -207,10 +264,12 @@ def _package(values: Sequence[str]) -> Package:
     return Package(name, version, architecture, role, archive, int(size), sha256, path)  # type: ignore[arg-type]
 
 
-def read_list(name: str) -> list[Wish]:
+def read_list(name: str) -> list[PackageRequest]:
     """A package list: `[kernel] PACKAGE # reason` a line."""
     path = paths.PACKAGES / f"{name}.list"
-    wishes = []
+    if not path.is_file():
+        raise UserError(f"{paths.shown(path)}: is missing; write `PACKAGE # reason` lines, as in the other lists")
+    requests = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         entry, _, reason = (part.strip() for part in line.partition("#"))
         if not entry:
@@ -220,42 +279,59 @@ def read_list(name: str) -> list[Wish]:
             raise UserError(
                 f"{paths.shown(path)}:{number}: '{line}': write `PACKAGE # reason` or `kernel PACKAGE # reason`"
             )
-        wishes.append(Wish(match[2], bool(match[1]), reason))
-    return wishes
+        requests.append(PackageRequest(match[2], bool(match[1]), reason))
+    return requests
 
 
-def wishes(name: str) -> list[Wish]:
+def requests(recipe: Recipe) -> list[PackageRequest]:
     """What the lists of a lock ask for."""
-    return [wish for each in _RECIPES[name].lists for wish in read_list(each)]
+    asked = [request for each in recipe.lists for request in read_list(each)]
+    if recipe.system and not any(request.kernel for request in asked):
+        path = paths.PACKAGES / f"{recipe.lists[-1]}.list"
+        raise UserError(f"{paths.shown(path)}: names no kernel; add a line `kernel linux-image-… # reason`")
+    return asked
 
 
 # --- resolution ---
 
 
-def update_locks(names: Iterable[str] = NAMES, mirrors: Mirrors | None = None, without: Collection[str] = ()) -> str:
-    """Resolve the package lists against the mirrors, write the locks and say what changed, a line each.
+def chosen(recipes: Mapping[str, Recipe], names: Sequence[str]) -> dict[str, Recipe]:
+    """Those of these names; all of them where none is given."""
+    if unknown := [name for name in names if name not in recipes]:
+        raise UserError(f"{', '.join(unknown)}: there is no such lock; there are {', '.join(recipes)}")
+    return {name: recipe for name, recipe in recipes.items() if name in names or not names}
+
+
+def update_locks(recipes: Mapping[str, Recipe], mirrors: Mirrors | None = None, without: Collection[str] = ()) -> str:
+    """Resolve package lists against the mirrors, write the locks and say what changed, a line each.
 
     `without` names suites to leave out, for a mirror whose copy of one is broken: what a signature does not cover is
     never used, so the choice is between fewer packages and none. The lock says which suites it was made from.
     """
     mirrors = mirrors or mirror.resolve()
     changes = []
-    for name in names:
+    for name, recipe in recipes.items():
         with progress.step(f"lock of {name}"):
-            new = resolve(name, mirrors, without)
+            new = resolve(name, recipe, mirrors, without)
         path = lock_file(name)
         old = read_lock(name) if path.is_file() else None
-        if old and old.packages == new.packages:
+        if old and old.packages == new.packages and old.missing_suites == new.missing_suites:
+            if new.current > old.current:
+                _write(path, dataclasses.replace(old, checked=new.current))
             changes.append(f"{name}: unchanged")  # nor does its epoch change: the same packages, the same image
             continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(f".{path.name}.new")
-        beside.write_text(format_lock(new), encoding="utf-8")
-        beside.replace(path)
+        _write(path, new)
         total = progress.size(sum(package.size for package in new.packages))
         changes.append(f"{name}: {len(new.packages)} packages, {total}")
         changes += [f"  {line}" for line in difference(old.packages if old else (), new.packages)]
     return "\n".join(changes)
+
+
+def _write(path: Path, lock: Lock) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.new")
+    beside.write_text(format_lock(lock), encoding="utf-8")
+    beside.replace(path)
 
 
 def difference(old: Iterable[Package], new: Iterable[Package]) -> list[str]:
@@ -272,28 +348,27 @@ def difference(old: Iterable[Package], new: Iterable[Package]) -> list[str]:
     return [line for _, line in sorted((added | removed | changed).items())]
 
 
-def resolve(name: str, mirrors: Mirrors, without: Collection[str] = ()) -> Lock:
+def resolve(name: str, recipe: Recipe, mirrors: Mirrors, without: Collection[str] = ()) -> Lock:
     """Ask apt what the lists of a lock come to today."""
-    recipe = _RECIPES[name]
-    apt = Apt(recipe.architecture, mirrors, [suite for suite in _SUITES if suite[1] not in without])
+    asked = requests(recipe)
+    apt = Apt(recipe.architecture, mirrors, [suite for suite in suites(recipe.suite) if suite[1] not in without])
     apt.update()
-    asked = wishes(name)
     index = apt.index()
     required = {
         fields["Package"]
         for _, fields in index.values()
         if fields.get("Essential") == "yes" or fields.get("Priority") == "required"
     }
-    userland = {wish.package for wish in asked if not wish.kernel}
+    userland = {request.package for request in asked if not request.kernel}
     if recipe.system:
         userland |= required | {"apt"}  # debootstrap's smallest variant holds these
     selected: dict[str, Role] = {
         address: "required" if index[address][1]["Package"] in required else "userland"
         for address in apt.install(sorted(userland))
     }
-    for wish in asked:
-        if wish.kernel:
-            selected[apt.address(apt.concrete(wish.package))] = "kernel"
+    for request in asked:
+        if request.kernel:
+            selected[apt.address(apt.concrete(request.package))] = "kernel"
     packages = [
         Package(
             name=fields["Package"],
@@ -315,7 +390,7 @@ class Apt:
     """apt as resolver and verifier, in a directory of its own: no root, and nothing of this computer's configuration
     but its proxy."""
 
-    def __init__(self, architecture: str, mirrors: Mirrors, suites: Sequence[tuple[str, str]] = _SUITES) -> None:
+    def __init__(self, architecture: str, mirrors: Mirrors, suites: Sequence[tuple[str, str]]) -> None:
         self.architecture = architecture
         self.sources = suites
         self.archives = {archive: mirrors.of(archive) for archive, _ in suites}

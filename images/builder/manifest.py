@@ -14,16 +14,19 @@ import shutil
 import subprocess
 import sys
 import uuid
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, JsonValue
 
-from images.builder import cache, card, compare, mirror, paths, runtime
-from images.builder.errors import UserError
+from flotilla.common import cache, paths
+from flotilla.common.errors import UserError
+from flotilla.fleet.apps import BuiltApp
+from flotilla.fleet.model import Board, Fleet, Robot
+from images.builder import card, compare, mirror, runtime
 from images.builder.filesystem import Node
-from images.builder.fleet import Board, Fleet, Robot
 from images.builder.lock import Lock
 from images.builder.tools import Tools
 
@@ -88,6 +91,17 @@ class LockId(_Model):
     """Those that the lock was made without: packages lack what these have, such as security updates."""
 
 
+class App(_Model):
+    """An app that the inventory gives to the robot."""
+
+    name: str
+    version: str
+    bytes: int
+    """Of its files."""
+    sha256: str
+    """Of its listing on the robot, which has the SHA-256 of each file: /etc/flotilla/apps/NAME."""
+
+
 class Source(_Model):
     """The git checkout that built the image."""
 
@@ -129,6 +143,7 @@ class Manifest(_Model):
     parts: list[Part]
     partitions: list[Partition]
     packages: list[Package]
+    apps: list[App] = []
     hostvars: dict[str, JsonValue]
     """The robot's merged inventory variables, as the fleet model says them."""
 
@@ -152,8 +167,11 @@ def read(image: Path, remedy: str) -> Manifest:
 # --- once per board ---
 
 
-def shared(board: Board, lock: Lock, root: Path, base: Path, tools: Tools) -> Path:
-    """Directory with `shared.json` and the bills of materials of a board's robots."""
+def shared(board: Board, lock: Lock, root: Path, content: Path, base: Path, tools: Tools) -> Path:
+    """Directory with `shared.json` and the bills of materials of a board's robots.
+
+    `root`, `content`, `base`: what `rootfs.build`, `slot.build` and `card.base` made.
+    """
     key = cache.digest(
         board.name, lock.digest, root.name, base.name, tools.directory.name, paths.PROJECT / "requirements.lock",
         Path(__file__),
@@ -163,7 +181,7 @@ def shared(board: Board, lock: Lock, root: Path, base: Path, tools: Tools) -> Pa
         status = tools.run("usr/bin/unsquashfs", "-cat", root / "root.squashfs", _DPKG_STATUS)
         made = Shared(
             kernel=json.loads((root / "contents.json").read_text())["kernel"],
-            parts=board_parts(root, base),
+            parts=board_parts(root, content, base),
             packages=packages(status),
         )
         lean = board.kernel == "lean"
@@ -178,12 +196,13 @@ def shared(board: Board, lock: Lock, root: Path, base: Path, tools: Tools) -> Pa
     return cache.result("manifest", key, make)
 
 
-def board_parts(root: Path, base: Path) -> list[Part]:
+def board_parts(root: Path, content: Path, base: Path) -> list[Part]:
     """What all cards of a board have in common, piece by piece."""
     start = card.extents(base)[0]
-    regions = {"mbr+grub": start, "boot partition": (card.BOOT.start, card.BOOT.size)}
+    regions = {"mbr+grub": start, "boot state": (card.STATE.start, card.STATE.size)}
     parts = [part(name, base / "card.img", *region) for name, region in regions.items()]
     files = [root / name for name in ("vmlinuz", "initrd.img", "root.squashfs") if (root / name).exists()]
+    files.append(content / "slot.img")
     return parts + [part(file.name, file, 0, file.stat().st_size) for file in files]
 
 
@@ -284,6 +303,7 @@ def write(
     common: Path,
     *,
     nodes: list[Node],
+    apps: Sequence[BuiltApp],
     source: Source | None,
     data: Part,
     image: Part,
@@ -311,11 +331,59 @@ def write(
         parts=[*same.parts, data],
         partitions=partitions(extents),
         packages=same.packages,
+        apps=[told(app) for app in apps],
         hostvars=hostvars(fleet, robot),
     )
     file_of(beside).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
     for ending in SBOMS:
-        shutil.copyfile(common / f"sbom.{ending}", beside.with_suffix(f".{ending}"))
+        bill = common / f"sbom.{ending}"
+        if manifest.apps:
+            text = with_apps(bill.read_text(encoding="utf-8"), robot.name, manifest.apps)
+            beside.with_suffix(f".{ending}").write_text(text, encoding="utf-8")
+        else:
+            shutil.copyfile(bill, beside.with_suffix(f".{ending}"))
+
+
+def told(app: BuiltApp) -> App:
+    """What a manifest says of an app."""
+    return App(name=app.name, version=app.version, bytes=app.bytes, sha256=app.sha256)
+
+
+def with_apps(bill: str, robot: str, apps: Sequence[App]) -> str:
+    """A board's bill of materials with the apps of a robot: another document, with an identity of its own."""
+    document = json.loads(bill)
+    words = [f"flotilla {robot}", cache.digest(bill), *(app.model_dump_json() for app in apps)]
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, " ".join(words))
+    if "spdxVersion" in document:
+        document["documentNamespace"] = f"urn:uuid:{identity}"
+        relationships = document["relationships"]
+        (system,) = (it["relatedSpdxElement"] for it in relationships if it["relationshipType"] == "DESCRIBES")
+        for app in apps:
+            reference = f"SPDXRef-app-{app.name}"
+            document["packages"].append(
+                {
+                    "SPDXID": reference, "name": app.name, "versionInfo": app.version,
+                    "checksums": [{"algorithm": "SHA256", "checksumValue": app.sha256}],
+                    "downloadLocation": "NOASSERTION", "filesAnalyzed": False, "primaryPackagePurpose": "APPLICATION",
+                    "licenseConcluded": "NOASSERTION", "licenseDeclared": "NOASSERTION", "copyrightText": "NOASSERTION",
+                }
+            )  # fmt: skip
+            of = {"spdxElementId": reference, "relatedSpdxElement": system, "relationshipType": "PACKAGE_OF"}
+            relationships.append(of)
+    else:
+        document["serialNumber"] = f"urn:uuid:{identity}"
+        system = document["metadata"]["component"]["bom-ref"]
+        (depends,) = (it["dependsOn"] for it in document["dependencies"] if it["ref"] == system)
+        for app in apps:
+            reference = f"app/{app.name}@{app.version}"
+            document["components"].append(
+                {
+                    "type": "application", "bom-ref": reference, "name": app.name, "version": app.version,
+                    "hashes": [{"alg": "SHA-256", "content": app.sha256}],
+                }
+            )  # fmt: skip
+            depends.append(reference)
+    return json.dumps(_sorted(document), indent=1, ensure_ascii=False, sort_keys=True) + "\n"
 
 
 def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
@@ -324,19 +392,25 @@ def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
     identity = [
         part
         for node in nodes
-        for part in (f"{node.path} {node.mode:o} {node.uid} {node.gid}", node.content or b"", str(node.content is None))
+        for part in (
+            f"{node.path} {node.mode:o} {node.uid} {node.gid}{node.target and f' -> {node.target}'}",
+            node.content or b"",
+            str(node.content is None),
+        )
     ]
     own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
     return cache.digest(
         *(lock.digest for lock in locks), *own_kernel, runtime.key(board.architecture), paths.OVERLAY,
-        images / "rootfs", images / "builder", images / "grub.cfg.j2", paths.PROJECT / "requirements.lock",
+        images / "release.yml", images / "rootfs", images / "boot", images / "builder",
+        paths.PROJECT / "flotilla" / "fleet", paths.PROJECT / "flotilla" / "common",
+        paths.PROJECT / "requirements.lock",
         board.model_dump_json(), *identity,
     )  # fmt: skip
 
 
 def partitions(extents: card.Extents) -> list[Partition]:
     """The partition table, with how much of each partition the extents of a card fill."""
-    contents = {"boot": "ext2", "A": "squashfs", "B": "empty", "data": "ext4"}
+    contents = {"state": "raw", "A": "squashfs", "B": "empty", "data": "ext4"}
     return [
         Partition(
             number=partition.number,
@@ -349,7 +423,7 @@ def partitions(extents: card.Extents) -> list[Partition]:
                 length for start, length in extents if partition.start <= start < partition.start + partition.size
             ),
         )
-        for partition in (card.BOOT, *card.SLOTS, card.DATA)
+        for partition in (card.STATE, *card.SLOTS, card.DATA)
     ]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from images.builder.errors import UserError
+from flotilla.common.errors import UserError
 
 DEBIAN = "debian"
 SECURITY = "debian-security"
@@ -20,11 +20,8 @@ ARCHIVES = (DEBIAN, SECURITY)
 
 _VARIABLES = {DEBIAN: "MIRROR", SECURITY: "SECURITY_MIRROR"}
 _EXAMPLES = {DEBIAN: "http://MIRROR/debian", SECURITY: "http://MIRROR/debian-security"}
-_SUITES = {
-    # An archive's suites share one pool, so any of them will do.
-    DEBIAN: re.compile(r"(bullseye|bookworm|trixie|forky|sid|(old)*stable|testing|unstable)(-updates)?"),
-    SECURITY: re.compile(r"(bullseye|bookworm|trixie|forky|(old)*stable|testing)-security"),
-}
+_ALWAYS = r"sid|(old)*stable|testing|unstable"
+"""What Debian calls suites besides the names of releases. Those are data: this computer's says os-release."""
 _SCHEMES = ("http://", "https://", "file:/")
 _MIRROR_LIST = "mirror+file:"
 _FIELD = re.compile(r"^([!-9;-~]+):[ \t]*(.*(?:\n[ \t].*)*)", re.MULTILINE)
@@ -54,7 +51,8 @@ def resolve(
     os_release: Path = Path("/etc/os-release"),
 ) -> Mirrors:
     """The mirrors to use. One that is missing is an error only when it is needed: see `Mirrors.of`."""
-    found = dict(_configured(apt)) if _is_debian(os_release) else {}
+    names = _suites(os_release)
+    found = dict(_configured(apt, names)) if names else {}
     for archive, variable in _VARIABLES.items():
         if address := environment.get(variable):
             if not address.startswith(_SCHEMES):
@@ -83,15 +81,24 @@ def _advice(archive: str) -> str:
     )
 
 
-def _is_debian(os_release: Path) -> bool:
-    """Whether apt's sources can be Debian's: on Ubuntu and others they are of another archive."""
-    return os_release.is_file() and re.search(r'^ID="?debian"?$', os_release.read_text(), re.MULTILINE) is not None
+def _suites(os_release: Path) -> str:
+    """A pattern of the names that suites of this computer's Debian have; none elsewhere, where sources are others'."""
+    text = os_release.read_text() if os_release.is_file() else ""
+    said = dict(re.findall(r"""^(\w+)=["']?(.*?)["']?$""", text, re.MULTILINE))
+    if said.get("ID") != "debian":
+        return ""
+    own = said.get("VERSION_CODENAME")
+    return f"{_ALWAYS}|{re.escape(own)}" if own else _ALWAYS
 
 
-def _configured(apt: Path) -> Iterator[tuple[str, str]]:
-    """Archive and address of every source of Debian's that apt knows, the most preferred last."""
+def _configured(apt: Path, names: str) -> Iterator[tuple[str, str]]:
+    """Archive and address of every source of Debian's that apt knows, the most preferred last.
+
+    An archive's suites share one pool, so any of them will do.
+    """
+    patterns = {DEBIAN: re.compile(f"({names})(-updates)?"), SECURITY: re.compile(f"({names})-security")}
     for address, suites, components in reversed(list(_sources(apt))):
-        for archive, pattern in _SUITES.items():
+        for archive, pattern in patterns.items():
             if "main" in components and any(pattern.fullmatch(suite) for suite in suites):
                 for usable in _usable(address, apt):
                     yield archive, usable

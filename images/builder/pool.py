@@ -15,9 +15,10 @@ from datetime import timedelta
 from pathlib import Path
 from urllib.parse import quote
 
-from images.builder import cache, mirror, paths, progress
-from images.builder.errors import UserError
-from images.builder.lock import SUITE, Lock, Package
+from flotilla.common import cache, paths, progress
+from flotilla.common.errors import UserError
+from images.builder import mirror
+from images.builder.lock import Lock, Package
 from images.builder.mirror import Mirrors
 
 _CONNECTIONS = 8
@@ -55,7 +56,7 @@ def fill(locks: Iterable[Lock], mirrors: Mirrors | None = None) -> None:
                 mirrors.of(archive)
         total = sum(package.size for _, package in missing)
         with progress.step(f"downloading {len(missing)} packages, {progress.size(total)}") as step:
-            _download_all(missing, mirrors, lambda done: step.at(done, total, "bytes"))
+            _download_all(missing, mirrors, lambda done: step.at(done >> 20, total >> 20, "MiB"))
 
 
 def verify_hashes(lock: Lock) -> None:
@@ -77,21 +78,22 @@ def verify_hashes(lock: Lock) -> None:
 def repository(lock: Lock, directory: Path) -> None:
     """A package repository of just the lock's packages, which it verifies; no signature, so it is for
 
-    `debootstrap --no-check-gpg --variant=minbase bookworm TARGET file://DIRECTORY`.
+    `debootstrap --no-check-gpg --variant=minbase RELEASE TARGET file://DIRECTORY`.
     """
     verify_hashes(lock)
-    index = directory / "dists" / SUITE / "main" / f"binary-{lock.architecture}"
+    index = directory / "dists" / lock.release / "main" / f"binary-{lock.architecture}"
     index.mkdir(parents=True)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        controls = threads.map(_control, lock.packages)
+        controls = threads.map(control, lock.packages)
     stanzas = []
-    for package, control in zip(lock.packages, controls, strict=True):
+    for package, described in zip(lock.packages, controls, strict=True):
         _link(file(package), directory / package.path)
-        stanzas.append(_stanza(package, control))
+        stanzas.append(_stanza(package, described))
     content = "".join(stanzas).encode()
     (index / "Packages").write_bytes(content)
     (index.parents[1] / "Release").write_text(
-        f"Origin: Debian\nSuite: {SUITE}\nCodename: {SUITE}\nArchitectures: {lock.architecture}\nComponents: main\n"
+        f"Origin: Debian\nSuite: {lock.release}\nCodename: {lock.release}\n"
+        f"Architectures: {lock.architecture}\nComponents: main\n"
         f"SHA256:\n {hashlib.sha256(content).hexdigest()} {len(content)} main/binary-{lock.architecture}/Packages\n",
         encoding="utf-8",
     )
@@ -244,8 +246,8 @@ def _receive(address: str, beside: Path, count: Callable[[int], None]) -> tuple[
 # --- repository ---
 
 
-def _control(package: Package) -> str:
-    """The package's own description of itself."""
+def control(package: Package) -> str:
+    """The package's own description of itself. UserError where the pool's file is damaged."""
     argv = ["dpkg-deb", "--field", str(file(package))]
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -253,12 +255,12 @@ def _control(package: Package) -> str:
     return done.stdout
 
 
-def _stanza(package: Package, control: str) -> str:
+def _stanza(package: Package, described: str) -> str:
     """Its stanza in the repository's index. The archive's word on what is required stands above the package's own.
 
     debootstrap misses a stanza that no empty line ends.
     """
-    kept = re.sub(r"^Priority: .*\n", "", control, flags=re.MULTILINE)
+    kept = re.sub(r"^Priority: .*\n", "", described, flags=re.MULTILINE)
     return (
         f"{kept.rstrip()}\nPriority: {'required' if package.role == 'required' else 'optional'}\n"
         f"Filename: {package.path}\nSize: {package.size}\nSHA256: {package.sha256}\n\n"

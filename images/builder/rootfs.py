@@ -19,9 +19,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from images.builder import cache, debian_kernel, initramfs, kernel, namespace, paths, pool, progress, runtime, tools
+from flotilla.common import cache, namespace, paths, progress
+from flotilla.fleet.model import Board
+from images.builder import debian_kernel, initramfs, kernel, pool, runtime, tools
 from images.builder.chroot import Chroot, mount
-from images.builder.fleet import Board
 from images.builder.lock import Lock
 
 _DATA = paths.PROJECT / "images" / "rootfs"
@@ -29,6 +30,11 @@ COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-
 """zstd: a Pentium III unpacks it several times faster than xz, at about 8 % more bytes. A boot reads hundreds of small
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
 _SIZE_LIMIT = "3g"
+_BOOTSTRAP = "debootstrap"
+_SECONDS = {_BOOTSTRAP: 80, "kernel": 10, "runtime": 1, "overlay": 1, "clean": 0, "initramfs": 6, "squashfs": 50}
+"""The stage's parts, in their order, and about how long each takes on two cores: how far a build is."""
+_PACKAGE = re.compile(r"^I: (?:Unpacking|Configuring) [^ ]+\.\.\.$", re.MULTILINE)
+"""What debootstrap says of a package, twice of each."""
 _STAGE_FILES = ("rootfs.py", "chroot.py", "debian_kernel.py", "initramfs.py", "init")
 
 
@@ -37,7 +43,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
 
     Debian's kernel needs an `initrd.img` too; ours holds what a boot needs.
     """
-    own = kernel.build(board.name) if board.kernel == "lean" else None
+    own = kernel.board_kernel(board) if board.kernel == "lean" else None
     if own:
         lock = lock.without("kernel")
     drivers = runtime.build(lock.architecture)
@@ -57,8 +63,10 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     def make(out: Path) -> None:
         toolset = tools.tree(tools_lock)
         log = paths.BUILD / f"rootfs-{board.name}.log"
-        title = f"root file system of {board.name}"
-        with progress.step(f"{title} ({len(lock.packages)} packages)"):
+        log.unlink(missing_ok=True)  # an earlier build's
+        packages = lock.having("required", "userland")
+        title = f"root file system of {board.name} ({len(lock.packages)} packages)"
+        with progress.step(title, lambda: far(progress.text(log), len(packages))):
             repository = out / "repository"
             pool.repository(lock, repository)
             kernels = [package.path for package in lock.having("kernel")]
@@ -68,8 +76,9 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             shutil.copy(drivers.package, repository)
             stage = {
                 "architecture": lock.architecture,
+                "release": lock.release,
                 "epoch": lock.epoch,
-                "packages": [package.name for package in lock.having("required", "userland")],
+                "packages": [package.name for package in packages],
                 "kernels": kernels,
                 "runtime": drivers.package.name,
                 "disk_modules": None if own else board.disk_modules,
@@ -85,6 +94,16 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             (out / "vmlinuz").write_bytes(debian_kernel.repacked((out / "vmlinuz").read_bytes()))
 
     return cache.result("rootfs", key, make)
+
+
+def far(log: str, packages: int) -> progress.Far:
+    """How far a build is that has written `log`, with so many packages to unpack and configure."""
+    begun = re.findall(r"^== (\w+)$", log, re.MULTILINE)
+    if not begun:
+        return progress.Far(0, sum(_SECONDS.values()), part="repository")
+    *ended, part = begun
+    share = _SECONDS[part] * len(_PACKAGE.findall(log)) / (2 * packages) if part == _BOOTSTRAP else 0
+    return progress.Far(sum(_SECONDS[name] for name in ended) + share, sum(_SECONDS.values()), part=part)
 
 
 def _overlay_files() -> list[Path]:
@@ -112,6 +131,7 @@ class Stage:
             }
         self.in_tools = self._tools.run
         self.in_target = self._target.run
+        self.shown_in_tools, self.shown_in_target = self._tools.log, self._target.log
 
     def mount(self, repository: str, out: str) -> None:
         """All inside the private mount namespace: nothing to undo."""
@@ -137,8 +157,8 @@ def main(description_file: str) -> None:
     stage.mount(description["repository"], description["out"])
     print(f"clock of the stage: {time.strftime('%F')}")
     stage.in_tools("date", "+clock of the tools: %F")
-    with _timed("debootstrap"):
-        _bootstrap(stage, description["architecture"], description["packages"])
+    with _timed(_BOOTSTRAP):
+        _bootstrap(stage, description["architecture"], description["release"], description["packages"])
     stage.in_target("perl", "-MPOSIX=strftime", "-e", 'print strftime("clock of the target: %F\\n", gmtime)')
     with _timed("kernel"):
         version = _kernel(stage, description["kernels"])
@@ -175,18 +195,18 @@ def main(description_file: str) -> None:
     (out / "contents.json").write_text(json.dumps(contents, indent=1, sort_keys=True) + "\n")
 
 
-def _bootstrap(stage: Stage, architecture: str, packages: list[str]) -> None:
+def _bootstrap(stage: Stage, architecture: str, release: str, packages: list[str]) -> None:
     include = ",".join(packages)
-    stage.in_tools(
+    stage.shown_in_tools(
         "debootstrap", "--no-check-gpg", "--foreign", "--variant=minbase", f"--arch={architecture}",
-        f"--include={include}", "bookworm", "/target", "file:///repository",
+        f"--include={include}", release, "/target", "file:///repository",
     )  # fmt: skip
     # Maintainer scripts look for configuration files, so those go afterwards (_remove_excluded), the rest never comes.
     rules = [(keep, pattern) for keep, pattern in path_rules() if not pattern.startswith("/etc/")]
     config = ["force-unsafe-io", *(f"path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rules)]
     (stage.target / "etc/dpkg/dpkg.cfg.d").mkdir(parents=True, exist_ok=True)
     (stage.target / "etc/dpkg/dpkg.cfg.d/flotilla").write_text("\n".join(config) + "\n")
-    stage.in_target("/debootstrap/debootstrap", "--second-stage")
+    stage.shown_in_target("/debootstrap/debootstrap", "--second-stage")
 
 
 def _list(name: str) -> list[str]:
@@ -259,7 +279,7 @@ def _lay_overlay(target: Path) -> None:
             place.unlink(missing_ok=True)
             place.symlink_to(source.readlink())
         else:
-            shutil.copyfile(source, place)
+            place.write_bytes(source.read_bytes())
             place.chmod(0o755 if os.access(source, os.X_OK) else 0o644)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import tempfile
@@ -10,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from images.builder import cache, namespace, paths, pool, progress, runtime_stage, toolchain, tools
-from images.builder.errors import UserError
+from flotilla.common import cache, namespace, paths, progress
+from flotilla.common.errors import UserError
+from images.builder import pool, runtime_stage, toolchain, tools
 from images.builder.lock import read_lock
 
 SOURCE = paths.PROJECT / "runtime"
@@ -24,7 +26,7 @@ _LOADERS = {
     "i386": ("lib/ld-linux.so.2", "usr/lib/i386-linux-gnu"),
 }
 """The dynamic loader and the libraries in a tree of an architecture. A 64-bit PC runs programs for both."""
-_LEFT_OUT = ("bench", "station", "tests")
+_LEFT_OUT = ("bench", "tests", "tidy.py")
 """Folders of the source that no package comes from."""
 
 
@@ -154,9 +156,19 @@ def build(architecture: str) -> Runtime:
             place = out / "source" / path.relative_to(SOURCE)
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, place)
-        with progress.step(f"runtime for {architecture}"):
+        log = paths.BUILD / f"runtime-{architecture}.log"
+        log.unlink(missing_ok=True)  # an earlier build's
+        with progress.step(f"runtime for {architecture}", lambda: far(progress.text(log))):
             arguments = [str(tree), str(out), architecture, str(lock.epoch), json.dumps(LIBRARIES)]
-            log = paths.BUILD / f"runtime-{architecture}.log"
             namespace.run_stage(runtime_stage.__name__, arguments, log)
 
     return Runtime(cache.result("runtime", key(architecture), make))
+
+
+def far(log: str) -> progress.Far:
+    """How far a build is that has written `log`: ninja numbers what it does."""
+    numbered = re.findall(r"^\[(\d+)/(\d+)\]", log, re.MULTILINE)
+    if not numbered:
+        return progress.Far()
+    done, total = map(int, numbered[-1])
+    return progress.Far(done, total, "files")

@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from images.builder import card, manifest, paths, pool, progress, tools
-from images.builder.errors import UserError
+from flotilla.common import paths, progress
+from flotilla.common.errors import UserError
+from images.builder import card, manifest, pool, tools
 from images.builder.lock import read_lock
 
 _SHOWN = 20

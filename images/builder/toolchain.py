@@ -9,7 +9,8 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from images.builder import namespace, paths, pool, tools
+from flotilla.common import namespace, paths
+from images.builder import pool, tools
 from images.builder.chroot import Chroot
 from images.builder.lock import read_lock
 

@@ -10,8 +10,9 @@ import os
 import subprocess
 from pathlib import Path
 
-from images.builder import cache, namespace, pool, progress
-from images.builder.errors import UserError
+from flotilla.common import cache, namespace, progress
+from flotilla.common.errors import UserError
+from images.builder import pool
 from images.builder.lock import Lock
 
 _MERGED = ("bin", "sbin", "lib", "lib32", "lib64")

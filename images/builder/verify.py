@@ -21,16 +21,18 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from images.builder import build, cache, compare, namespace, paths, pool, progress, tools
-from images.builder.errors import UserError
-from images.builder.fleet import Board, Fleet, Robot
-from images.builder.lock import Lock, read_lock
+from flotilla.common import cache, namespace, paths, progress
+from flotilla.common.errors import UserError
+from flotilla.fleet.apps import BuiltApp
+from flotilla.fleet.model import Board, Fleet, Robot
+from images.builder import build, compare, pool, tools
+from images.builder.lock import Lock, board_lock, read_lock
 
 _USER = "flotilla-verify"
 _FIRST_USER = 61000
@@ -43,6 +45,8 @@ _DAYS = 40
 _TRIPLETS = {"amd64": "x86_64-linux-gnu", "i386": "i386-linux-gnu"}
 _PLACES = ("/mnt", "/srv", "/opt", "/media")
 _PLANTED = "etc/planted"
+_ENDED = re.compile(r": \d+\.\d s$|left$")
+"""How lines of progress end, without a terminal."""
 _SKIPPED = {".git", "__pycache__", ".mypy_cache", ".ruff_cache", ".pytest_cache"}
 
 
@@ -69,22 +73,27 @@ class _Circumstances:
         return Path(self.place, "somebody", "elsewhere")
 
 
-def verify(fleet: Fleet, robot: Robot, *, plant: bool = False) -> str:
+def verify(fleet: Fleet, robot: Robot, apps: Sequence[BuiltApp] = (), *, plant: bool = False) -> str:
     """Build `robot`'s image twice and say what was varied; UserError with what differs.
 
+    `apps`: the robot's, built for its board; the second build compiles them again.
     `plant` writes the time of day into the second checkout, to show that a difference is found and named; only the
     tools are taken from the first build's cache then.
     """
     started = time.monotonic()
     board = fleet.boards[robot.board]
     with cache.locked(paths.BUILD / ".verify.lock"), _directory() as directory:
-        (first,) = build.build(fleet, [robot])
+        (first,) = build.build(fleet, [robot], apps={robot.name: apps})
         circumstances, notes = _prepare(directory, board, robot, plant=plant)
         kept = directory / "first.img"
         kept.hardlink_to(first)  # a build meanwhile puts another in its place
         before = datetime.now(UTC)
         log = paths.BUILD / "verify.log"
-        with progress.step(f"second image of {robot.name}, elsewhere"):
+        log.unlink(missing_ok=True)  # an earlier one's
+        progress.say(
+            "the second image starts from an empty cache: some minutes on two cores, longer with a kernel of our own"
+        )
+        with progress.step(f"second image of {robot.name}, elsewhere", lambda: far(progress.text(log))):
             _run(circumstances, log)
         check_clock(directory / "build" / f"rootfs-{board.name}.log", before)
         second = directory / "build" / "images" / first.name
@@ -101,6 +110,11 @@ def verify(fleet: Fleet, robot: Robot, *, plant: bool = False) -> str:
                 + f"\n  it is kept as {paths.shown(saved)}"
             )
     return f"{robot.name}: identical; varied: {', '.join(notes)}; {time.monotonic() - started:.0f} s"
+
+
+def far(log: str) -> progress.Far:
+    """What the second build said last of its own parts."""
+    return progress.Far(said=next((line for line in reversed(log.splitlines()) if _ENDED.search(line)), ""))
 
 
 @contextmanager
@@ -139,11 +153,13 @@ def _prepare(directory: Path, board: Board, robot: Robot, *, plant: bool) -> tup
         packages=sysconfig.get_path("purelib"),
     )
     copy_checkout(directory / "checkout")
+    if paths.APPS != paths.PROJECT / "apps" and paths.APPS.exists():
+        shutil.copytree(paths.APPS, directory / "checkout/apps", symlinks=True, copy_function=_copy_as_cloned)
     if plant:
         overlay = directory / "checkout" / paths.OVERLAY.relative_to(paths.PROJECT)
         (overlay / _PLANTED).write_text(f"{datetime.now(UTC)}\n")
     shutil.copytree(paths.KEYS, directory / "keys")
-    lock, tools_lock = read_lock(board.name), read_lock("tools")
+    lock, tools_lock = board_lock(board), read_lock("tools")
     (directory / "build/pool").mkdir(parents=True)
     (directory / "build/cache").mkdir()
     for package in {*lock.packages, *tools_lock.packages}:
@@ -173,6 +189,8 @@ def copy_checkout(copy: Path) -> None:
 
     def skipped(parent: str, names: list[str]) -> set[str]:
         kept_out = {paths.BUILD, paths.KEYS}
+        if paths.APPS != paths.PROJECT / "apps":
+            kept_out.add(paths.PROJECT / "apps")
         return {name for name in names if name in _SKIPPED or Path(parent, name).resolve() in kept_out}
 
     shutil.copytree(paths.PROJECT, copy, symlinks=True, ignore=skipped, copy_function=_copy_as_cloned)
@@ -308,8 +326,8 @@ def main(description_file: str) -> int:
     argv = [
         *owner,
         *("env", "--ignore-environment", *(f"{name}={value}" for name, value in environment.items())),
-        *(str(elsewhere / "build/venv/bin/python"), "-m", "images.builder", "image"),
-        *("--robot", str(circumstances.robot)),
+        *(str(elsewhere / "build/venv/bin/python"), "-m", "flotilla", "image"),
+        str(circumstances.robot),
     ]
     return subprocess.run(argv, cwd=elsewhere / "checkout", check=False).returncode
 

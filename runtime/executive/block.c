@@ -1,136 +1,17 @@
-/* Instances of blocks: memory, failures, ports. */
+/* Instances of blocks: their memory, ports and signals. */
 #define _GNU_SOURCE
 #include "block.h"
 
 #include "device.h"
-#include "inner.h"
 
-#include <errno.h>
-#include <flotilla/block.h>
-#include <sched.h>
-#include <semaphore.h>
-#include <signal.h>
-#include <stdarg.h>
-#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
-
-static const struct {
-    const char *name;
-    size_t size;
-} types[FL_TYPES] = {
-    [FL_BOOLEAN] = {"boolean", 1}, [FL_INT8] = {"int8", 1},     [FL_UINT8] = {"uint8", 1},   [FL_INT16] = {"int16", 2},
-    [FL_UINT16] = {"uint16", 2},   [FL_INT32] = {"int32", 4},   [FL_UINT32] = {"uint32", 4}, [FL_INT64] = {"int64", 8},
-    [FL_UINT64] = {"uint64", 8},   [FL_SINGLE] = {"single", 4}, [FL_DOUBLE] = {"double", 8},
-};
-
-size_t fl_type_size(enum fl_type type)
-{
-    return types[type].size;
-}
-
-const char *fl_type_name(enum fl_type type)
-{
-    return types[type].name;
-}
-
-int fl_type_named(const char *name)
-{
-    for (int type = 0; type < FL_TYPES; type++)
-        if (strcmp(types[type].name, name) == 0)
-            return type;
-    return -1;
-}
-
-int64_t fl_now_ns(void)
-{
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
-}
-
-enum { LINE = BLOCK_LINE }; /* rings keep their two ends on cache lines of their own */
-
-void *fl_allocate(struct fl_block *block, size_t bytes)
-{
-    size_t rounded = LINE + (bytes + LINE - 1) / LINE * LINE;
-    struct fl_memory *memory = bytes < SIZE_MAX - 2 * (size_t)LINE ? aligned_alloc(LINE, rounded) : NULL;
-    if (!memory) {
-        fl_fail(block, "no memory for %zu bytes", bytes);
-        return NULL;
-    }
-    memset(memory, 0, rounded);
-    memory->next = block->service->memory;
-    block->service->memory = memory;
-    return (char *)memory + LINE;
-}
-
-int fl_fail(struct fl_block *block, const char *format, ...)
-{
-    va_list arguments;
-    va_start(arguments, format);
-    vsnprintf(block->service->failure, sizeof block->service->failure, format, arguments);
-    va_end(arguments);
-    return FL_FAILED;
-}
-
-int fl_end(struct fl_block *block, const char *format, ...)
-{
-    va_list arguments;
-    va_start(arguments, format);
-    vsnprintf(block->service->failure, sizeof block->service->failure, format, arguments);
-    va_end(arguments);
-    block->service->ended = true;
-    return FL_FAILED;
-}
-
-bool fl_wired(const struct fl_block *block, uint32_t input)
-{
-    return block->service->wired[input];
-}
-
-void fl_log(struct fl_block *block, const char *format, ...)
-{
-    char line[256];
-    va_list arguments;
-    va_start(arguments, format);
-    vsnprintf(line, sizeof line, format, arguments);
-    va_end(arguments);
-    fprintf(stderr, "%s: %s\n", block->name, line);
-}
-
-static int add_port(struct fl_block *block, struct fl_port **ports, uint32_t *count, struct fl_port port)
-{
-    struct fl_port *more = fl_allocate(block, sizeof port * (*count + 1));
-    if (!more)
-        return FL_FAILED;
-    if (*ports)
-        memcpy(more, *ports, sizeof port * *count);
-    more[(*count)++] = port;
-    *ports = more;
-    return FL_OK;
-}
-
-int fl_add_input(struct fl_block *block, struct fl_port port)
-{
-    int result = add_port(block, &block->service->in_ports, &block->in_count, port);
-    block->in_ports = block->service->in_ports;
-    return result;
-}
-
-int fl_add_output(struct fl_block *block, struct fl_port port)
-{
-    int result = add_port(block, &block->service->out_ports, &block->out_count, port);
-    block->out_ports = block->service->out_ports;
-    return result;
-}
 
 /* A block and its small pieces: parameters, wires, scalar signals. Side by side, because what a step touches has left
  * the cache by the next one. */
 struct placed {
     struct fl_block block;
-    _Alignas(LINE) unsigned char near[BLOCK_NEAR];
+    _Alignas(FL_CACHE_LINE) unsigned char near[BLOCK_NEAR];
 };
 
 static void *place(struct fl_block *block, size_t bytes)
@@ -146,7 +27,7 @@ static void *place(struct fl_block *block, size_t bytes)
 
 struct fl_block *block_create(const struct fl_block_type *type, const char *name)
 {
-    struct fl_block *block = aligned_alloc(LINE, sizeof(struct placed));
+    struct fl_block *block = aligned_alloc(FL_CACHE_LINE, sizeof(struct placed));
     struct fl_service *service = calloc(1, sizeof *service);
     char *copy = strdup(name);
     if (!block || !service || !copy)
@@ -196,7 +77,8 @@ void block_destroy(struct fl_block *block)
 {
     if (!block)
         return;
-    inner_destroy(block);
+    if (block->service->destroy_inner)
+        block->service->destroy_inner(block);
     device_release(block->service);
     for (struct fl_memory *memory = block->service->memory, *next; memory; memory = next) {
         next = memory->next;
@@ -205,61 +87,4 @@ void block_destroy(struct fl_block *block)
     free(block->service);
     free((char *)(uintptr_t)block->name);
     free(block);
-}
-
-enum { HANDLERS_STACK_BYTES = 32 * 1024 }; /* frames of several handlers, and what `safe` needs */
-
-void *fl_service_enter(void *(*enter)(void *), void *argument)
-{
-    unsigned char reserve[HANDLERS_STACK_BYTES]; /* at the far end of the stack from where that overflows */
-    stack_t before;
-    sigaltstack(&(stack_t){.ss_sp = reserve, .ss_size = sizeof reserve}, &before);
-    void *result = enter(argument);
-    sigaltstack(&before, NULL);
-    return result;
-}
-
-struct starting {
-    void *(*enter)(void *);
-    void *argument;
-    sem_t taken;
-};
-
-static void *enter_thread(void *argument)
-{
-    struct starting *starting = argument;
-    void *(*enter)(void *) = starting->enter;
-    void *context = starting->argument;
-    sem_post(&starting->taken); /* it is gone now */
-    return fl_service_enter(enter, context);
-}
-
-int fl_service_thread(struct fl_service *service, pthread_t *thread, const char *name, void *(*enter)(void *),
-                      void *argument)
-{
-    pthread_attr_t attributes;
-    struct starting starting = {enter, argument, {{0}}};
-    size_t stack = 0;
-    int error = pthread_attr_init(&attributes);
-    if (error)
-        return error;
-    if (pthread_attr_getstacksize(&attributes, &stack) == 0)
-        pthread_attr_setstacksize(&attributes, stack + HANDLERS_STACK_BYTES);
-    sem_init(&starting.taken, 0, 0);
-    if (service->priority) {
-        pthread_attr_setinheritsched(&attributes, PTHREAD_EXPLICIT_SCHED);
-        pthread_attr_setschedpolicy(&attributes, SCHED_FIFO);
-        pthread_attr_setschedparam(&attributes, &(struct sched_param){.sched_priority = service->priority});
-    }
-    error = pthread_create(thread, &attributes, enter_thread, &starting);
-    pthread_attr_destroy(&attributes);
-    if (!error) {
-        while (sem_wait(&starting.taken) < 0)
-            continue; /* interrupted */
-        char shown[16];
-        snprintf(shown, sizeof shown, "%s", name);
-        pthread_setname_np(*thread, shown);
-    }
-    sem_destroy(&starting.taken);
-    return error;
 }

@@ -1,8 +1,8 @@
-/* Instances of blocks, as the executive and the tests make them. */
+/* Instances of blocks, for the executive and the tests. */
 #ifndef FLOTILLA_EXECUTIVE_BLOCK_H
 #define FLOTILLA_EXECUTIVE_BLOCK_H
 
-#include "service.h"
+#include "core/service.h"
 
 #include <flotilla/block.h>
 
@@ -15,22 +15,21 @@
 #endif
 
 enum {
-    BLOCK_LINE = 64,                               /* bytes of a cache line */
-    BLOCK_NEAR = BLOCK_ALONE ? 0 : 2 * BLOCK_LINE, /* beside a block, for its small pieces; AddressSanitizer only sees a
-                                                    * write beyond a piece that lies alone */
-    BLOCK_TOUCHED = 3 * BLOCK_LINE,                /* the block, and most often all of its pieces */
+    BLOCK_NEAR = BLOCK_ALONE ? 0 : 2 * FL_CACHE_LINE, /* beside a block, for its small pieces; AddressSanitizer only
+                                                       * sees a write beyond a piece that lies alone */
+    BLOCK_TOUCHED = 3 * FL_CACHE_LINE,                /* the block, and most often all of its pieces */
 };
 
-/* With the ports of the type's tables; parameters and state are zero. Not there yet: signals. */
+/* Create a block with the ports of its type; parameters and state are zero, signals are not made yet. */
 struct fl_block *block_create(const struct fl_block_type *type, const char *name);
 
-/* Storage of all outputs, and zeros for inputs, once `configure` has added its ports. */
+/* Allocate all outputs, and zeros for inputs without a wire, after `configure` has added its ports. */
 int block_make_signals(struct fl_block *block);
 
-/* Let an input read what `signal` points at. */
+/* Wire an input to `signal`. */
 void block_wire(struct fl_block *block, uint32_t port, const void *signal);
 
-/* A step of it begins, that was due at `release_ns`. */
+/* Begin a step that was due at `release_ns`. */
 static inline void block_release(struct fl_block *block, int64_t release_ns)
 {
     const int64_t longest_ns = FL_LONGEST_INTERVAL * block->period_ns;
@@ -40,14 +39,14 @@ static inline void block_release(struct fl_block *block, int64_t release_ns)
     block->release_ns = release_ns;
 }
 
-/* Bring what a step of it touches to the cache. NULL is allowed. */
+/* Prefetch the memory that a step touches. NULL is allowed. */
 static inline void block_prefetch(const struct fl_block *block)
 {
-    for (size_t at = 0; at < BLOCK_TOUCHED; at += BLOCK_LINE)
+    for (size_t at = 0; at < BLOCK_TOUCHED; at += FL_CACHE_LINE)
         __builtin_prefetch((const char *)block + at);
 }
 
-/* Free it and all it allocated, inner blocks too; after terminate. */
+/* Free the block and all that it allocated, inner blocks too; after terminate. */
 void block_destroy(struct fl_block *block);
 
 #endif

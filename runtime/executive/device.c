@@ -18,7 +18,7 @@
 enum {
     WAITING = 128,                /* processes that may wait for one device */
     LISTEN_MS = 50,               /* at least: from bind() to listen() of the holder */
-    LISTEN_POLL_NS = 1000 * 1000, /* nothing tells of it */
+    LISTEN_POLL_NS = 1000 * 1000, /* there is no event to wait for */
 };
 
 static bool names_device(const struct fl_parameter *parameter)
@@ -40,7 +40,8 @@ bool device_write(const struct fl_block *block, FILE *out)
     return any;
 }
 
-/* What tells the device from all others of the computer: a path by where it leads, all else with the type of block. */
+/* A key that is unique on the computer: for a path, the file it leads to; otherwise the type of block and the
+ * parameters. */
 static void write_key(const struct fl_block *block, FILE *out)
 {
     for (uint32_t i = 0; i < block->type->parameter_count; i++) {
@@ -75,7 +76,7 @@ static void write_shown(const struct fl_block *block, FILE *out)
     device_write(block, out);
 }
 
-/* The end of a long name tells devices apart, too. */
+/* Keep the end of a long name: that is where names differ. */
 static socklen_t address_of(const struct fl_block *block, struct sockaddr_un *address)
 {
     char *key = text_of(block, write_key);
@@ -99,7 +100,8 @@ static int hold(const struct sockaddr_un *address, socklen_t length)
     return -1;
 }
 
-/* Wait until the holder has gone, or CLOCK_MONOTONIC is `until_ns`; its process, 0 where that is not known. */
+/* Wait until the holder has ended, or CLOCK_MONOTONIC is `until_ns`. Returns its process, or 0 where that is unknown.
+ */
 static pid_t wait_for_holder(const struct sockaddr_un *address, socklen_t length, int64_t until_ns)
 {
     struct ucred holder = {0};
@@ -131,10 +133,10 @@ static int refuse(struct fl_block *block, pid_t process)
             command[i] = ' ';
     char *device = text_of(block, write_shown);
     if (process)
-        fl_fail(block, "%s is held by process %d (%s); a device serves one task, end that first", device, (int)process,
-                command);
-    else /* so many have asked for it, or it belongs to a container */
-        fl_fail(block, "%s is held by another process; a device serves one task, end that first", device);
+        fl_fail(block, "%s is held by process %d (%s); only one task may use a device: end that one first", device,
+                (int)process, command);
+    else /* too many processes wait for it, or the holder is in another container */
+        fl_fail(block, "%s is held by another process; only one task may use a device: end that one first", device);
     free(device);
     return FL_FAILED;
 }

@@ -7,6 +7,7 @@
 #include "safety.h"
 #include "schedule.h"
 #include "status.h"
+#include "tuner.h"
 #include "watch.h"
 
 #include <errno.h>
@@ -25,14 +26,14 @@
 enum {
     STACK_BYTES = 128 * 1024, /* touched before the first step */
     WATCH_MS = 20,
-    CATCH_UP_PERIODS = 10, /* further behind, the rest is left out */
-    HOLDER_MS = 1000,      /* to make outputs safe that another process has, until it ends */
-    LATE_PERIODS = 5,      /* from one step's end to the next one's: two for a late trigger, three for a late step */
-    HUNG_PERIODS = 10,     /* without a step, where no actuator's time-out says how many */
+    CATCH_UP_PERIODS = 10, /* further behind, the remaining steps are skipped */
+    HOLDER_MS = 1000,      /* wait for another process to release a device, when only making outputs safe */
+    LATE_PERIODS = 5, /* from the end of a step to the end of the next: two for a late trigger, three for a late step */
+    HUNG_PERIODS = 10, /* without a step, where no actuator time-out sets a limit */
 };
 
 #define SECOND_NS INT64_C(1000000000)
-#define NAP_NS    (SECOND_NS / 2) /* a task that sleeps hears within that time that it has to end */
+#define NAP_NS    (SECOND_NS / 2) /* longest sleep before the task looks whether it has to end */
 
 struct executive {
     struct task *task;
@@ -44,8 +45,8 @@ struct executive {
     pthread_t control;
     int ended_fd;
     _Atomic bool stop, ended;
-    struct status *status; /* for all other threads */
-    int signal;            /* that asked for the end; 0: none did */
+    struct status *status; /* read by all other threads */
+    int signal;            /* the signal that ended the task; 0: none */
     int output_error;      /* errno of stdout */
 };
 
@@ -62,19 +63,19 @@ static void end(struct run_result *result, enum ending ending, const struct fl_b
 static bool start_blocks(struct task *task, struct run_result *result)
 {
     for (size_t i = 0; i < task->count; i++) {
-        struct member *member = &task->members[i];
-        if (device_claim(member->block) != FL_OK) {
-            end(result, ENDING_FAILED, member->block, member->block->service->failure);
+        struct task_block *task_block = &task->blocks[i];
+        if (device_claim(task_block->block) != FL_OK) {
+            end(result, ENDING_FAILED, task_block->block, task_block->block->service->failure);
             return false;
         }
-        member->started = true; /* terminate also cleans up after a start that failed halfway */
-        if (member->block->type->start && member->block->type->start(member->block) != FL_OK) {
-            end(result, ENDING_FAILED, member->block, member->block->service->failure);
+        task_block->started = true; /* terminate also cleans up after a start that failed halfway */
+        if (task_block->block->type->start && task_block->block->type->start(task_block->block) != FL_OK) {
+            end(result, ENDING_FAILED, task_block->block, task_block->block->service->failure);
             return false;
         }
     }
     for (size_t i = 0; i < task->count; i++) {
-        struct fl_block *block = task->members[i].block;
+        struct fl_block *block = task->blocks[i].block;
         if (block->type->initialize && block->type->initialize(block) != FL_OK) {
             end(result, ENDING_FAILED, block, block->service->failure);
             return false;
@@ -86,17 +87,17 @@ static bool start_blocks(struct task *task, struct run_result *result)
 static void make_outputs_safe(struct task *task)
 {
     for (size_t i = task->count; i-- > 0;)
-        if (task->members[i].started && task->members[i].block->type->safe)
-            task->members[i].block->type->safe(task->members[i].block);
+        if (task->blocks[i].started && task->blocks[i].block->type->safe)
+            task->blocks[i].block->type->safe(task->blocks[i].block);
 }
 
 static void terminate_blocks(struct task *task)
 {
     for (size_t i = task->count; i-- > 0;) {
-        struct member *member = &task->members[i];
-        if (member->started && member->block->type->terminate)
-            member->block->type->terminate(member->block);
-        member->started = false;
+        struct task_block *task_block = &task->blocks[i];
+        if (task_block->started && task_block->block->type->terminate)
+            task_block->block->type->terminate(task_block->block);
+        task_block->started = false;
     }
 }
 
@@ -104,25 +105,25 @@ unsigned executive_make_safe(struct task *task)
 {
     unsigned failures = 0;
     for (size_t i = 0; i < task->count; i++) {
-        struct member *member = &task->members[i];
-        const struct fl_block_type *type = member->block->type;
+        struct task_block *task_block = &task->blocks[i];
+        const struct fl_block_type *type = task_block->block->type;
         if (!type->safe)
             continue;
-        member->block->service->patience_ms = HOLDER_MS;
-        member->failed = device_claim(member->block) != FL_OK;
-        if (member->failed)
+        task_block->block->service->patience_ms = HOLDER_MS;
+        task_block->failed = device_claim(task_block->block) != FL_OK;
+        if (task_block->failed)
             continue;
-        member->started = true;
-        member->failed = type->start && type->start(member->block) != FL_OK;
-        if (!member->failed)
-            type->safe(member->block);
+        task_block->started = true;
+        task_block->failed = type->start && type->start(task_block->block) != FL_OK;
+        if (!task_block->failed)
+            type->safe(task_block->block);
     }
     terminate_blocks(task);
-    /* Now that no output waits for whoever reads it. */
+    /* Report only after all outputs are safe: the reader of stderr may be slow. */
     for (size_t i = 0; i < task->count; i++) {
-        if (!task->members[i].failed)
+        if (!task->blocks[i].failed)
             continue;
-        fprintf(stderr, "%s: %s\n", task->members[i].block->name, task->members[i].block->service->failure);
+        fprintf(stderr, "%s: %s\n", task->blocks[i].block->name, task->blocks[i].block->service->failure);
         failures++;
     }
     return failures;
@@ -149,7 +150,8 @@ static void sleep_until(int64_t wake_ns)
         continue;
 }
 
-/* Sleep until then, or until the task has to end: periods may be longer than the service manager waits for that. */
+/* Sleep until that time, or until the task has to end. A period may exceed the watchdog interval of the service
+ * manager. */
 static void sleep_unless_stopped(struct executive *executive, int64_t wake_ns)
 {
     int64_t nap_ns;
@@ -159,7 +161,7 @@ static void sleep_unless_stopped(struct executive *executive, int64_t wake_ns)
         sleep_until(wake_ns);
 }
 
-/* The same for what triggers a step; when it came, 0 if it did not. */
+/* The same for the trigger. Returns when it fired, or 0 on time-out. */
 static int64_t await_unless_stopped(struct executive *executive, struct fl_block *trigger, int64_t latest_ns)
 {
     int64_t came_ns = 0, nap_ns;
@@ -168,12 +170,13 @@ static int64_t await_unless_stopped(struct executive *executive, struct fl_block
     return came_ns || asked_to_stop(executive) ? came_ns : trigger->type->await(trigger, latest_ns);
 }
 
-/* Wait until a step is due; when it was. `expected_ns`: when it should be, which what triggers it moves.
+/* Wait until a step is due. Returns when it was due. `expected_ns`: when it should be due; each trigger event moves it.
  *
- * A trigger may come half a period early or three quarters late. Nothing for longer is a step without it, so that there
- * are as many steps as periods and blocks notice the silence; something sooner waits, so that a flood cannot be a flood
- * of steps. What comes later than that makes two steps of this task, and two messages of which the next one may take
- * only the newer; a whole period's patience could not tell one that is late from the next.
+ * The trigger may fire from half a period early to three quarters of a period late. On trigger time-out the task steps
+ * without new input, so there are as many steps as periods, and blocks notice the silence. An event that comes sooner
+ * waits, so a flood of messages does not become a flood of steps. An event later than that leads to two steps and two
+ * messages, of which the next task may take only the newer. Waiting for a whole period could not distinguish a late
+ * event from the next one.
  */
 static int64_t wait_for_release(struct executive *executive, int64_t *expected_ns)
 {
@@ -196,8 +199,8 @@ static int64_t wait_for_release(struct executive *executive, int64_t *expected_n
     return *expected_ns;
 }
 
-/* When the step is expected after one that was expected at `expected_ns`, due at `release_ns`, and ended at `now_ns`.
- */
+/* When the next step is expected, after one that was expected at `expected_ns`, due at `release_ns`, and ended at
+ * `now_ns`. */
 static int64_t next_release(struct executive *executive, int64_t expected_ns, int64_t release_ns, int64_t now_ns,
                             int64_t *in_a_row)
 {
@@ -234,7 +237,7 @@ static void *control(void *argument)
     int64_t in_a_row = 0, period_ns = executive->task->period_ns;
     safety_step_begin();
     touch_stack();
-    /* By multiples of the period, so that tasks of one computer keep their phases to each other. */
+    /* Skip whole periods, so that the tasks of one computer keep their phases relative to each other. */
     int64_t expected_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
     while (!asked_to_stop(executive)) {
         int64_t release_ns = wait_for_release(executive, &expected_ns);
@@ -271,7 +274,7 @@ static void *control(void *argument)
 
 /* --- guarding thread --- */
 
-/* A step that never ends. */
+/* End the process because a step does not end. */
 static _Noreturn void abandon(const struct executive *executive, int64_t silent_ns)
 {
     char text[512];
@@ -281,20 +284,21 @@ static _Noreturn void abandon(const struct executive *executive, int64_t silent_
     safety_abandon(text);
 }
 
-/* For how long no step may end: as an actuator holds its outputs without a command. */
+/* How long the task may go without the end of a step: as long as an actuator holds its outputs without a command. */
 static int64_t patience_of(const struct executive *executive)
 {
     const struct task *task = executive->task;
     int64_t patience_ns = executive->options->no_wait ? INT64_MAX : task_actuator_timeout(task);
-    if (patience_ns == INT64_MAX) /* there is none, or time is not measured */
+    if (patience_ns == INT64_MAX) /* no actuator, or time is not measured */
         return HUNG_PERIODS * task->period_ns + SECOND_NS;
     return patience_ns > LATE_PERIODS * task->period_ns ? patience_ns : LATE_PERIODS * task->period_ns;
 }
 
-/* Until the control thread has ended, or cannot.
+/* Guard until the control thread has ended, or end the process because it cannot end.
  *
- * It wakes when patience would end. Where it does so late itself, it was the computer that stood still, and the control
- * thread gets a part of the time again: it too could not run. */
+ * The guard wakes when the time limit expires. If the guard itself wakes late, the whole computer was stopped, and the
+ * control thread could not run either: it gets part of the limit again.
+ */
 static void *guard(void *argument)
 {
     struct executive *executive = argument;
@@ -318,7 +322,7 @@ static void *guard(void *argument)
 
 /* --- serving thread --- */
 
-/* A reader that has gone ends the task as a signal does. */
+/* End the task when the reader of its output has gone, as a signal would. */
 static void print_watched(struct executive *executive)
 {
     int error = executive->watch ? watch_print(executive->watch) : 0;
@@ -338,7 +342,7 @@ static void take_signal(struct executive *executive, int signals_fd)
     atomic_store(&executive->stop, true);
 }
 
-/* Why it ended, if nothing was wrong with the steps. */
+/* Why the task ended, where no step failed. */
 static void end_as_asked(const struct executive *executive)
 {
     static const int asking[] = {SIGTERM, SIGINT, SIGHUP, SIGQUIT, SIGTSTP};
@@ -348,16 +352,16 @@ static void end_as_asked(const struct executive *executive)
         asked |= executive->signal == asking[i];
     if (!asked) {
         const char *name = sigabbrev_np(executive->signal);
-        snprintf(text, sizeof text, "signal %d%s%s came", executive->signal, name ? ", SIG" : "", name ? name : "");
+        snprintf(text, sizeof text, "received signal %d%s%s", executive->signal, name ? ", SIG" : "", name ? name : "");
         end(executive->result, ENDING_FAILED, NULL, text);
     } else if (executive->output_error && executive->output_error != EPIPE) {
         snprintf(text, sizeof text, "what is watched cannot be printed: %s", strerror(executive->output_error));
         end(executive->result, ENDING_FAILED, NULL, text);
     }
-    end(executive->result, ENDING_ASKED, NULL, "a signal asked for it, or nobody reads what is watched any more");
+    end(executive->result, ENDING_ASKED, NULL, "a signal came, or the reader of the watched signals has gone");
 }
 
-/* Until the control thread has ended. */
+/* Serve until the control thread has ended. */
 static void serve(struct executive *executive, int signals_fd)
 {
     uint64_t usec = 0, last = 0;
@@ -374,7 +378,7 @@ static void serve(struct executive *executive, int signals_fd)
             take_signal(executive, signals_fd);
         int64_t now_ns = fl_now_ns();
         uint64_t steps = status_steps(executive->status);
-        /* Only a task that steps may say that it is alive; the guard comes first when it does not. */
+        /* Only a task that steps may report that it is alive. When it does not step, the guard acts first. */
         if (guarded && (steps != last || patience_ns > now_ns - moved_ns) && now_ns - notified_ns >= interval_ns) {
             sd_notify(0, "WATCHDOG=1");
             notified_ns = now_ns;
@@ -401,7 +405,7 @@ static void serve_parameters(const struct executive *executive)
                 strerror(error));
 }
 
-/* The threads that step and guard; 0 or an errno. Signals that ask for the end are blocked in both. */
+/* Start the control thread and its guard; 0 or an errno. Signals that end the task are blocked in both. */
 static int start_threads(struct executive *executive, int priority, pthread_t *guarding)
 {
     struct fl_service stepping = {.priority = priority};
@@ -436,7 +440,7 @@ static void *run(void *argument)
         privilege_lock_memory();
     int priority = options->no_wait ? 0 : privilege_priority(task->priority, "steps will be late under load");
     for (size_t i = 0; i < task->count; i++)
-        task->members[i].block->service->priority = priority ? priority - 1 : 0;
+        task->blocks[i].block->service->priority = priority ? priority - 1 : 0;
     if (start_blocks(task, result)) {
         executive->status = status_create(task);
         int error = start_threads(executive, priority, &guarding);
@@ -484,9 +488,10 @@ void executive_write_statistics(const struct task *task, const struct run_result
     statistics_write(&result->step, out);
     fprintf(out, ",\n \"blocks\": {");
     for (size_t i = 0; i < task->count; i++) {
-        const struct member *member = &task->members[i];
+        const struct task_block *task_block = &task->blocks[i];
         fprintf(out, "%s\n  \"%s\": {\"count\": %" PRIu64 ", \"mean_ns\": %" PRId64 ", \"max_ns\": %" PRId64 "}",
-                i ? "," : "", member->block->name, member->took.count, member->took.mean_ns, member->took.max_ns);
+                i ? "," : "", task_block->block->name, task_block->timing.count, task_block->timing.mean_ns,
+                task_block->timing.max_ns);
     }
     fprintf(out, "}}\n");
 }

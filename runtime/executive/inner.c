@@ -16,8 +16,8 @@ enum { PORTS_BYTES = 1024, TUNABLES = 64 };
 struct fl_inner {
     struct fl_inner *next; /* of the same outer block */
     struct fl_block *outer, *block;
-    struct written *written; /* parameters, until it starts */
-    size_t written_count;
+    struct raw_value *raw; /* parameters, until it starts */
+    size_t raw_count;
     const char *tunable[TUNABLES];
     const struct fl_parameter *tuned[TUNABLES];
     size_t tunable_count;
@@ -44,13 +44,21 @@ void fl_inner_safe(const struct fl_block *outer)
             inner->block->type->safe(inner->block);
 }
 
-/* The first failure counts. */
+/* Keep the first failure only. */
 static void fail(const struct fl_inner *inner, const char *type, const char *reason)
 {
     if (inner->outer->service->inner_failed)
         return;
     inner->outer->service->inner_failed = true;
     fl_fail(inner->outer, "inner %s: %s", type, reason);
+}
+
+static void destroy(const struct fl_block *outer)
+{
+    for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next) {
+        free(inner->raw);
+        block_destroy(inner->block);
+    }
 }
 
 struct fl_inner *fl_inner_new(const char *type, double period_s)
@@ -72,7 +80,7 @@ struct fl_inner *fl_inner_new(const char *type, double period_s)
     int64_t period_ns = llround(fmin(period_s, 1e9) * 1e9);
     if (!(period_s >= 0) || (period_ns && period_ns % beginning->period_ns)) {
         char reason[128];
-        snprintf(reason, sizeof reason, "its period of %g s is no multiple of the block's, %g s", period_s,
+        snprintf(reason, sizeof reason, "its period of %g s is not a multiple of the block's, %g s", period_s,
                  (double)beginning->period_ns / 1e9);
         fail(inner, type, reason);
         return inner;
@@ -83,42 +91,43 @@ struct fl_inner *fl_inner_new(const char *type, double period_s)
     inner->block->service->patience_ms = service->patience_ms;
     inner->next = service->inner;
     service->inner = inner;
+    service->destroy_inner = destroy;
     return inner;
 }
 
-/* Room for one more value with `count` texts; NULL after a failure. */
-static struct written *more(struct fl_inner *inner, const char *parameter, bool list, size_t count)
+/* Append a value with room for `count` strings; NULL after a failure. */
+static struct raw_value *more(struct fl_inner *inner, const char *parameter, bool list, size_t count)
 {
     if (!inner || !inner->block)
         return NULL;
-    struct written *written = realloc(inner->written, sizeof *written * (inner->written_count + 1));
+    struct raw_value *raw = realloc(inner->raw, sizeof *raw * (inner->raw_count + 1));
     const char **text = fl_allocate(inner->block, sizeof *text * (count + 1));
-    if (!written || !text)
+    if (!raw || !text)
         abort(); /* as block_create does: nothing runs yet */
-    inner->written = written;
-    written += inner->written_count++;
-    *written = (struct written){.name = parameter, .line = 0, .list = list, .text = text};
-    return written;
+    inner->raw = raw;
+    raw += inner->raw_count++;
+    *raw = (struct raw_value){.name = parameter, .line = 0, .list = list, .text = text};
+    return raw;
 }
 
-static void add_text(const struct fl_inner *inner, struct written *written, const char *text, size_t length)
+static void add_text(const struct fl_inner *inner, struct raw_value *raw, const char *text, size_t length)
 {
     char *copy = fl_allocate(inner->block, length + 1);
     if (!copy)
         abort();
     memcpy(copy, text, length);
-    written->text[written->count++] = copy;
+    raw->text[raw->count++] = copy;
 }
 
-void fl_inner_text(struct fl_inner *inner, const char *parameter, const void *text, size_t length)
+void fl_inner_parameter(struct fl_inner *inner, const char *parameter, const void *text, size_t length)
 {
     const char *at = text, *end = at + length;
     bool list = length >= 2 && at[0] == '[' && end[-1] == ']';
-    struct written *written = more(inner, parameter, list, length);
-    if (!written)
+    struct raw_value *raw = more(inner, parameter, list, length);
+    if (!raw)
         return;
     if (!list) {
-        add_text(inner, written, at, length);
+        add_text(inner, raw, at, length);
         return;
     }
     for (at++, end--; at < end;) {
@@ -127,12 +136,12 @@ void fl_inner_text(struct fl_inner *inner, const char *parameter, const void *te
             at++;
         while (last > at && last[-1] == ' ')
             last--;
-        add_text(inner, written, at, (size_t)(last - at));
+        add_text(inner, raw, at, (size_t)(last - at));
         at = next ? next + 1 : end;
     }
 }
 
-/* NULL: fl_inner_start says that there is none. */
+/* NULL where there is none, which fl_inner_start reports. */
 static const struct fl_parameter *parameter_of(const struct fl_inner *inner, const char *name)
 {
     char reason[256];
@@ -141,17 +150,17 @@ static const struct fl_parameter *parameter_of(const struct fl_inner *inner, con
 
 void fl_inner_numbers(struct fl_inner *inner, const char *parameter, const double *values, size_t count)
 {
-    struct written *written = more(inner, parameter, count != 1, count);
-    if (!written)
+    struct raw_value *raw = more(inner, parameter, count != 1, count);
+    if (!raw)
         return;
     const struct fl_parameter *found = parameter_of(inner, parameter);
-    enum fl_kind kind = found ? found->kind : FL_KIND_REAL;
+    enum fl_kind kind = found ? found->kind : FL_KIND_DOUBLE;
     for (size_t i = 0; i < count; i++) {
         char text[32];
         snprintf(text, sizeof text, "%.17g", values[i]);
         if (kind == FL_KIND_BOOLEAN && (strcmp(text, "0") == 0 || strcmp(text, "1") == 0))
             snprintf(text, sizeof text, *text == '1' ? "true" : "false");
-        add_text(inner, written, text, strlen(text));
+        add_text(inner, raw, text, strlen(text));
     }
 }
 
@@ -162,7 +171,7 @@ void fl_inner_tunable(struct fl_inner *inner, const char *parameter, double valu
         inner->tunable[inner->tunable_count++] = parameter;
 }
 
-/* In one text, without its last new line. */
+/* Set all parameters; problems go into one message, without its last newline. */
 static bool set_parameters(struct fl_inner *inner)
 {
     char *said = NULL;
@@ -170,15 +179,15 @@ static bool set_parameters(struct fl_inner *inner)
     struct problems problems = {.file = "parameters", .out = open_memstream(&said, &size)};
     if (!problems.out)
         abort();
-    parameters_set(inner->block, inner->written, inner->written_count, 0, &problems);
+    parameters_set(inner->block, inner->raw, inner->raw_count, 0, &problems);
     fclose(problems.out);
     if (problems.count) {
         said[size - 1] = '\0';
         fail(inner, inner->block->type->name, said);
     }
     free(said);
-    free(inner->written);
-    inner->written = NULL;
+    free(inner->raw);
+    inner->raw = NULL;
     for (size_t i = 0; i < inner->tunable_count; i++)
         inner->tuned[i] = parameter_of(inner, inner->tunable[i]);
     return !problems.count;
@@ -220,8 +229,8 @@ void fl_inner_start(struct fl_inner *inner, const char *ports)
     fl_inner_ports(block, found, sizeof found);
     if (strcmp(found, ports) != 0) {
         snprintf(reason, sizeof reason,
-                 "its ports are %s, and the code was made for %s; make it anew by flotilla-blocks --legacy-code", found,
-                 ports);
+                 "its ports are %s, and the code was made for %s; generate it again with flotilla-blocks --legacy-code",
+                 found, ports);
         fail(inner, type->name, reason);
         return;
     }
@@ -271,7 +280,7 @@ static bool allowed(const struct fl_parameter *parameter, double value)
 {
     if (!isfinite(value) || (parameter->kind == FL_KIND_BOOLEAN && (value < 0 || value > 1)))
         return false;
-    if (parameter->kind != FL_KIND_REAL && (fabs(value) > 0x1p53 || value - floor(value) > 0))
+    if (parameter->kind != FL_KIND_DOUBLE && (fabs(value) > 0x1p53 || value - floor(value) > 0))
         return false;
     return !(parameter->min < parameter->max) || (value >= parameter->min && value <= parameter->max);
 }
@@ -339,12 +348,4 @@ int64_t inner_shortest(const struct fl_block *outer, int64_t (*of)(const struct 
         shortest = value < shortest ? value : shortest;
     }
     return shortest;
-}
-
-void inner_destroy(const struct fl_block *outer)
-{
-    for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next) {
-        free(inner->written);
-        block_destroy(inner->block);
-    }
 }

@@ -4,13 +4,10 @@
 
 #include <flotilla/inner.h>
 
-/* With its parameters and ports, not started; NULL after the outer block was told why. */
+/* The configured block, not started; NULL after a failure was reported to the outer block. */
 struct fl_block *inner_configure(struct fl_inner *inner);
 
-/* The least that `of` says of the inner blocks of one; INT64_MAX: it has none. */
+/* The least value of `of` among the inner blocks; INT64_MAX: there is no inner block. */
 int64_t inner_shortest(const struct fl_block *outer, int64_t (*of)(const struct fl_block *block));
-
-/* Free the inner blocks of one. */
-void inner_destroy(const struct fl_block *outer);
 
 #endif

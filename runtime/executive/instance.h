@@ -1,4 +1,5 @@
-/* One run of a task at a time: the file itself is the lock, so nothing stays behind when the process dies. */
+/* Allows one run of a task at a time. The lock is on the task file itself, so a process that dies leaves nothing
+ * behind. */
 #ifndef FLOTILLA_INSTANCE_H
 #define FLOTILLA_INSTANCE_H
 

@@ -10,10 +10,10 @@
 static const char *const kind_names[] = {
     [FL_KIND_BOOLEAN] = "true or false",
     [FL_KIND_INTEGER] = "a whole number",
-    [FL_KIND_REAL] = "a number",
-    [FL_KIND_TEXT] = "a text",
-    [FL_KIND_REALS] = "a list of numbers",
-    [FL_KIND_TEXTS] = "a list of texts",
+    [FL_KIND_DOUBLE] = "a number",
+    [FL_KIND_STRING] = "a string",
+    [FL_KIND_DOUBLES] = "a list of numbers",
+    [FL_KIND_STRINGS] = "a list of strings",
     [FL_KIND_CHOICE] = "one of its choices",
     [FL_KIND_DEVICE] = "a device's path",
     [FL_KIND_UNSIGNED] = "a whole number from 0",
@@ -49,7 +49,7 @@ bool read_unsigned(const char *text, uint64_t *value)
     return true;
 }
 
-bool read_real(const char *text, double *value)
+bool read_double(const char *text, double *value)
 {
     char *end;
     if (!*text || isspace((unsigned char)*text))
@@ -89,7 +89,7 @@ static bool read_boolean(const char *text, bool *value)
     return *value || strcmp(text, "false") == 0;
 }
 
-static int choice_named(const char *choices, const char *name)
+int parameter_choice(const char *choices, const char *name)
 {
     size_t length = strlen(name);
     for (int index = 0;; index++) {
@@ -114,23 +114,23 @@ static const char *kept(struct fl_block *block, const char *text)
     return copy ? memcpy(copy, text, bytes) : NULL;
 }
 
-static bool read_reals(struct fl_block *block, const struct fl_parameter *parameter, const struct written *value,
-                       struct fl_reals *reals, const char **outside)
+static bool read_doubles(struct fl_block *block, const struct fl_parameter *parameter, const struct raw_value *value,
+                         struct fl_doubles *doubles, const char **outside)
 {
     double *numbers = fl_allocate(block, sizeof(double) * (value->count + 1));
     if (!numbers)
         return false;
     for (size_t i = 0; i < value->count; i++) {
-        if (!read_real(value->text[i], &numbers[i]))
+        if (!read_double(value->text[i], &numbers[i]))
             return false;
         if (!in_range(parameter, numbers[i]) && !*outside)
             *outside = value->text[i];
     }
-    *reals = (struct fl_reals){value->count, numbers};
+    *doubles = (struct fl_doubles){value->count, numbers};
     return true;
 }
 
-static bool read_texts(struct fl_block *block, const struct written *value, struct fl_texts *texts)
+static bool read_strings(struct fl_block *block, const struct raw_value *value, struct fl_strings *strings)
 {
     const char **copies = fl_allocate(block, sizeof(char *) * (value->count + 1));
     if (!copies)
@@ -138,16 +138,16 @@ static bool read_texts(struct fl_block *block, const struct written *value, stru
     for (size_t i = 0; i < value->count; i++)
         if (!(copies[i] = kept(block, value->text[i])))
             return false;
-    *texts = (struct fl_texts){value->count, copies};
+    *strings = (struct fl_strings){value->count, copies};
     return true;
 }
 
-/* Into a place of the kind's C type. `outside` is set to the first number out of range. */
-static bool read_kind(struct fl_block *block, const struct fl_parameter *parameter, const struct written *value,
+/* Read a value into `place`, of the C type of the kind. `outside` is set to the first number that is out of range. */
+static bool read_kind(struct fl_block *block, const struct fl_parameter *parameter, const struct raw_value *value,
                       void *place, const char **outside)
 {
     const char *text = value->count ? value->text[0] : "";
-    if (value->list && parameter->kind != FL_KIND_REALS && parameter->kind != FL_KIND_TEXTS)
+    if (value->list && parameter->kind != FL_KIND_DOUBLES && parameter->kind != FL_KIND_STRINGS)
         return false;
     switch (parameter->kind) {
     case FL_KIND_BOOLEAN:
@@ -164,22 +164,22 @@ static bool read_kind(struct fl_block *block, const struct fl_parameter *paramet
         if (!in_range(parameter, (double)*(uint64_t *)place))
             *outside = text;
         return true;
-    case FL_KIND_REAL:
-        if (!read_real(text, place))
+    case FL_KIND_DOUBLE:
+        if (!read_double(text, place))
             return false;
         if (!in_range(parameter, *(double *)place))
             *outside = text;
         return true;
-    case FL_KIND_TEXT:
+    case FL_KIND_STRING:
         return (*(const char **)place = kept(block, text)) != NULL;
     case FL_KIND_DEVICE:
         return *text == '/' && (((struct fl_device *)place)->path = kept(block, text)) != NULL;
     case FL_KIND_CHOICE:
-        return (*(int *)place = choice_named(parameter->choices, text)) >= 0;
-    case FL_KIND_REALS:
-        return read_reals(block, parameter, value, place, outside);
-    case FL_KIND_TEXTS:
-        return read_texts(block, value, place);
+        return (*(int *)place = parameter_choice(parameter->choices, text)) >= 0;
+    case FL_KIND_DOUBLES:
+        return read_doubles(block, parameter, value, place, outside);
+    case FL_KIND_STRINGS:
+        return read_strings(block, value, place);
     }
     return false;
 }
@@ -189,10 +189,10 @@ size_t parameter_size(enum fl_kind kind)
     static const size_t sizes[] = {
         [FL_KIND_BOOLEAN] = sizeof(bool),
         [FL_KIND_INTEGER] = sizeof(int64_t),
-        [FL_KIND_REAL] = sizeof(double),
-        [FL_KIND_TEXT] = sizeof(const char *),
-        [FL_KIND_REALS] = sizeof(struct fl_reals),
-        [FL_KIND_TEXTS] = sizeof(struct fl_texts),
+        [FL_KIND_DOUBLE] = sizeof(double),
+        [FL_KIND_STRING] = sizeof(const char *),
+        [FL_KIND_DOUBLES] = sizeof(struct fl_doubles),
+        [FL_KIND_STRINGS] = sizeof(struct fl_strings),
         [FL_KIND_CHOICE] = sizeof(int),
         [FL_KIND_DEVICE] = sizeof(struct fl_device),
         [FL_KIND_UNSIGNED] = sizeof(uint64_t),
@@ -201,13 +201,13 @@ size_t parameter_size(enum fl_kind kind)
 }
 
 bool parameter_set(struct fl_block *block, const struct fl_parameter *parameter, void *parameters,
-                   const struct written *value, char *reason, size_t reason_size)
+                   const struct raw_value *value, char *reason, size_t reason_size)
 {
     union {
         bool boolean;
         int64_t integer;
-        double real;
-        struct fl_reals reals;
+        double number;
+        struct fl_doubles doubles;
         int choice;
         const char *text;
     } place = {.integer = 0};
@@ -216,7 +216,7 @@ bool parameter_set(struct fl_block *block, const struct fl_parameter *parameter,
     if (!read_kind(block, parameter, value, &place, &outside)) {
         const char *unit = parameter->unit && *parameter->unit ? parameter->unit : NULL;
         if (parameter->kind == FL_KIND_CHOICE)
-            snprintf(reason, reason_size, "%s is none of %s", text, parameter->choices);
+            snprintf(reason, reason_size, "%s is not one of %s", text, parameter->choices);
         else
             snprintf(reason, reason_size, "%s%s is not %s%s%s", value->list ? "the list beginning with " : "",
                      *text ? text : "nothing", kind_names[parameter->kind], unit ? " in " : "", unit ? unit : "");
@@ -253,8 +253,8 @@ const struct fl_parameter *parameter_find(const struct fl_block_type *type, cons
     return NULL;
 }
 
-/* The shortest text that is read as the same number. */
-static void write_real(double value, FILE *out)
+/* Write the shortest string that reads back as the same number. */
+static void write_double(double value, FILE *out)
 {
     char text[32];
     for (int digits = 15; digits <= 17; digits++) {
@@ -277,8 +277,8 @@ static void write_text(const char *text, FILE *out)
 void parameter_write(const struct fl_parameter *parameter, const void *parameters, FILE *out)
 {
     const void *place = (const char *)parameters + parameter->offset;
-    const struct fl_reals *reals = place;
-    const struct fl_texts *texts = place;
+    const struct fl_doubles *doubles = place;
+    const struct fl_strings *strings = place;
     const char *choices = parameter->choices;
     switch (parameter->kind) {
     case FL_KIND_BOOLEAN:
@@ -290,10 +290,10 @@ void parameter_write(const struct fl_parameter *parameter, const void *parameter
     case FL_KIND_UNSIGNED:
         fprintf(out, "%" PRIu64, *(const uint64_t *)place);
         break;
-    case FL_KIND_REAL:
-        write_real(*(const double *)place, out);
+    case FL_KIND_DOUBLE:
+        write_double(*(const double *)place, out);
         break;
-    case FL_KIND_TEXT:
+    case FL_KIND_STRING:
         write_text(*(const char *const *)place, out);
         break;
     case FL_KIND_DEVICE:
@@ -304,24 +304,24 @@ void parameter_write(const struct fl_parameter *parameter, const void *parameter
             choices += strcspn(choices, "|") + 1;
         fprintf(out, "%.*s", (int)strcspn(choices, "|"), choices);
         break;
-    case FL_KIND_REALS:
-        for (size_t i = 0; i < reals->count; i++) {
+    case FL_KIND_DOUBLES:
+        for (size_t i = 0; i < doubles->count; i++) {
             fputs(i ? ", " : "[", out);
-            write_real(reals->value[i], out);
+            write_double(doubles->value[i], out);
         }
-        fputs(reals->count ? "]" : "[]", out);
+        fputs(doubles->count ? "]" : "[]", out);
         break;
-    case FL_KIND_TEXTS:
-        for (size_t i = 0; i < texts->count; i++) {
+    case FL_KIND_STRINGS:
+        for (size_t i = 0; i < strings->count; i++) {
             fputs(i ? ", " : "[", out);
-            write_text(texts->value[i], out);
+            write_text(strings->value[i], out);
         }
-        fputs(texts->count ? "]" : "[]", out);
+        fputs(strings->count ? "]" : "[]", out);
         break;
     }
 }
 
-void parameters_set(struct fl_block *block, const struct written *written, size_t count, unsigned line,
+void parameters_set(struct fl_block *block, const struct raw_value *raw, size_t count, unsigned line,
                     struct problems *problems)
 {
     char reason[256];
@@ -329,24 +329,24 @@ void parameters_set(struct fl_block *block, const struct written *written, size_
     void *parameters = (void *)(uintptr_t)block->parameters;
     for (uint32_t i = 0; i < type->parameter_count; i++) {
         const struct fl_parameter *parameter = &type->parameters[i];
-        const struct written *value = NULL;
+        const struct raw_value *value = NULL;
         for (size_t w = 0; w < count && !value; w++)
-            if (strcmp(written[w].name, parameter->name) == 0)
-                value = &written[w];
-        /* An empty fallback is an empty list, or an empty text. */
-        const size_t written_fallback = parameter->fallback && *parameter->fallback;
-        const struct written fallback = {parameter->name, line, false, written_fallback,
-                                         (const char **)&parameter->fallback};
+            if (strcmp(raw[w].name, parameter->name) == 0)
+                value = &raw[w];
+        /* An empty default is an empty list or an empty string. */
+        const size_t default_count = parameter->default_value && *parameter->default_value;
+        const struct raw_value default_value = {parameter->name, line, false, default_count,
+                                                (const char **)&parameter->default_value};
         if (value && !value->list && !value->count)
-            continue; /* no value at all, as the reader of the file has said */
-        if (!value && !parameter->fallback)
+            continue; /* no value; the reader of the file has reported it */
+        if (!value && !parameter->default_value)
             problem(problems, line, "block %s: parameter %s of %s is missing: %s", block->name, parameter->name,
                     type->name, parameter->summary ? parameter->summary : kind_names[parameter->kind]);
-        else if (!parameter_set(block, parameter, parameters, value ? value : &fallback, reason, sizeof reason))
+        else if (!parameter_set(block, parameter, parameters, value ? value : &default_value, reason, sizeof reason))
             problem(problems, value ? value->line : line, "block %s: parameter %s: %s", block->name, parameter->name,
                     reason);
     }
     for (size_t w = 0; w < count; w++)
-        if (!parameter_find(type, written[w].name, reason, sizeof reason))
-            problem(problems, written[w].line, "block %s: %s", block->name, reason);
+        if (!parameter_find(type, raw[w].name, reason, sizeof reason))
+            problem(problems, raw[w].line, "block %s: %s", block->name, reason);
 }

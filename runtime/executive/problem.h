@@ -1,4 +1,4 @@
-/* What the user can mend, collected so that all is said at once: "file:line: message". */
+/* Collects what is wrong with a file, so that all of it is reported at once: "file:line: message". */
 #ifndef FLOTILLA_PROBLEM_H
 #define FLOTILLA_PROBLEM_H
 

@@ -34,9 +34,9 @@ static const char *fault(const struct registry *registry, const struct fl_block_
     for (uint32_t i = 0; i < type->parameter_count; i++) {
         const struct fl_parameter *parameter = &type->parameters[i];
         if ((parameter->kind == FL_KIND_CHOICE) != (parameter->choices != NULL))
-            return "a parameter has choices but is no int, or is one without";
-        if (parameter->flags & FL_ACTUATOR_TIMEOUT && parameter->kind != FL_KIND_REAL)
-            return "an actuator's time-out is no double";
+            return "a parameter of type int has no choices, or another has some";
+        if (parameter->flags & FL_ACTUATOR_TIMEOUT && parameter->kind != FL_KIND_DOUBLE)
+            return "an actuator's time-out is not a double";
         if (parameter->offset >= type->parameters_size)
             return "a parameter lies outside its structure";
     }
@@ -50,8 +50,9 @@ static unsigned add(struct registry *registry, const struct fl_block_type *const
     unsigned faults = 0;
     for (size_t i = 0; i < count; i++) {
         const struct fl_block_type *type = types[i];
-        if (type->abi != FL_ABI) { /* nothing else of it can be read */
-            fprintf(out, "%s: made for interface %u of blocks, this is %u; build it anew\n", origin, type->abi, FL_ABI);
+        if (type->abi != FL_ABI) { /* the rest of it cannot be read */
+            fprintf(out, "%s: built for block interface %u, this runtime has %u; rebuild it\n", origin, type->abi,
+                    FL_ABI);
             faults++;
             continue;
         }
@@ -85,7 +86,7 @@ static unsigned add_plugin(struct registry *registry, const char *path)
     }
     found.symbol = dlsym(library, "fl_blocks");
     if (!found.symbol) {
-        fprintf(out, "%s: announces no block; use FL_BLOCK of flotilla/block.h\n", path);
+        fprintf(out, "%s: defines no block; use FL_BLOCK of flotilla/block.h\n", path);
         dlclose(library);
         return 1;
     }
@@ -101,7 +102,7 @@ unsigned registry_fill(struct registry *registry, const char *plugins, FILE *out
     return add(registry, types, count, "flotilla");
 }
 
-/* Load the plug-ins of the first directory that waits. */
+/* Load the plug-ins of the next directory. */
 static unsigned load_next(struct registry *registry)
 {
     glob_t found;

@@ -1,4 +1,4 @@
-/* Types of blocks: those of the program, and those of plug-ins. */
+/* The known types of blocks: those of the program, and those of plug-ins. */
 #ifndef FLOTILLA_REGISTRY_H
 #define FLOTILLA_REGISTRY_H
 
@@ -9,21 +9,21 @@ struct registry {
     const struct fl_block_type **types; /* by name */
     size_t count;
     const char
-        *plugins; /* directories, separated by ':', of *.so that wait until a block is wanted which is not there */
-    FILE *out;    /* what is wrong with types and plug-ins */
+        *plugins; /* directories of plug-ins (*.so), separated by ':', that are loaded once a block is not found */
+    FILE *out;    /* for messages about faulty types and plug-ins */
 };
 
-/* The program's own blocks. `plugins` may be NULL, and a directory of it may not exist; it must live as long as the
- * registry. Number of faulty types, which are left out. */
+/* Fill the registry with the program's own blocks. `plugins` may be NULL, its directories need not exist, and it must
+ * live as long as the registry. Returns the number of faulty types, which are left out. */
 unsigned registry_fill(struct registry *registry, const char *plugins, FILE *out);
 
-/* Load the plug-ins that are not loaded yet. Number of those, and of their types, that were faulty and left out. */
+/* Load the remaining plug-ins. Returns the number of faulty plug-ins and types, which are left out. */
 unsigned registry_load_plugins(struct registry *registry);
 
-/* NULL: neither the program nor a plug-in has it. */
+/* The type of that name; NULL where neither the program nor a plug-in has it. */
 const struct fl_block_type *registry_find(struct registry *registry, const char *name);
 
-/* The name most like `name`, for a message. NULL: none is. */
+/* The known name most similar to `name`, for a message; NULL: none is similar. */
 const char *registry_nearest(const struct registry *registry, const char *name);
 
 void registry_clear(struct registry *registry);

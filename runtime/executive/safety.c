@@ -16,13 +16,13 @@ enum {
     PARK_POLL_NS = 50 * 1000, /* on one processor the thread gets it meanwhile */
 };
 
-/* One signal for what this file asks of itself: from tgkill() it parks a thread, from the timer it ends the process. */
+/* One signal with two uses: sent by tgkill() it parks a thread, sent by the timer it ends the process. */
 #define OWN_SIGNAL SIGRTMIN
 
 static const int fatal_signals[] = {SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGABRT, SIGSYS, SIGTRAP};
 #define FATAL_SIGNALS (sizeof fatal_signals / sizeof *fatal_signals)
 
-/* Of the process, as signals are. */
+/* One for the process, as signals are. */
 static struct {
     _Atomic(struct task *) task; /* NULL: nothing is to be made safe */
     pid_t process;               /* a child that a block forks has the handlers, but not the task */
@@ -32,7 +32,7 @@ static struct {
     _Atomic bool parked;
 } safety;
 
-/* All of what follows is called in signal handlers: only what signal-safety(7) allows. */
+/* All of the following runs in signal handlers: only what signal-safety(7) allows. */
 
 static void park_stepping(pid_t self)
 {
@@ -44,7 +44,7 @@ static void park_stepping(pid_t self)
         nanosleep(&(struct timespec){.tv_nsec = PARK_POLL_NS}, NULL);
 }
 
-/* A thread that fails in a block's `safe` comes here again, and goes on with the next block's. */
+/* A thread that fails in a block's `safe` comes here again and continues with the next block. */
 static void stop_outputs(void)
 {
     pid_t nobody = 0, self = gettid();
@@ -53,13 +53,13 @@ static void stop_outputs(void)
         return;
     if (!atomic_compare_exchange_strong(&safety.stopping, &nobody, self) && nobody != self)
         for (;;)
-            pause(); /* the other one ends the process */
+            pause(); /* the other thread ends the process */
     timer_settime(safety.limit, 0, &(struct itimerspec){.it_value.tv_sec = LIMIT_S}, NULL);
     park_stepping(self);
     while (atomic_load(&safety.left)) {
-        const struct member *member = &task->members[atomic_fetch_sub(&safety.left, 1) - 1];
-        if (member->started && member->block->type->safe)
-            member->block->type->safe(member->block);
+        const struct task_block *task_block = &task->blocks[atomic_fetch_sub(&safety.left, 1) - 1];
+        if (task_block->started && task_block->block->type->safe)
+            task_block->block->type->safe(task_block->block);
     }
 }
 

@@ -1,14 +1,14 @@
-/* Outputs in their reset state, and held there, however the task ends: by a step that never does, a fatal signal,
- * abort() or exit() in a block's code.
+/* Brings outputs to their reset state and keeps them there, however the task ends: a step that never ends, a fatal
+ * signal, abort() or exit() in a block.
  *
- * What makes outputs safe first parks the thread that steps: it waits in a signal handler until the process has died,
- * so no step of it writes an actuator after `safe`. Then it calls `safe` of each block, and the process ends. A second
- * from the first of these the process ends in any case.
+ * First the thread that steps is parked: it waits in a signal handler until the process has died, so no step writes an
+ * actuator after `safe`. Then `safe` of each block is called, and the process ends. It ends in any case one second
+ * after this began.
  *
- * Not even the kernel tells a process of SIGKILL, _exit() or the memory that ran out. Then outputs keep their state
- * until the actuator's own time-out, or until the service manager runs `flotilla-run --safe`.
+ * A process is not notified of SIGKILL, of _exit(), or of being killed for want of memory. Then outputs keep their
+ * state until the actuator's own time-out, or until the service manager runs `flotilla-run --safe`.
  *
- * Signals belong to the process, so there is one task at a time.
+ * Signals belong to the process, so a process runs one task at a time.
  */
 #ifndef FLOTILLA_SAFETY_H
 #define FLOTILLA_SAFETY_H
@@ -17,20 +17,20 @@
 
 #include <signal.h>
 
-/* From now on until safety_end(), the started blocks of `task` are made safe. Memory allocation and errors end the
- * process: nothing runs yet. */
+/* From now on until safety_end(), the started blocks of `task` are made safe. An error or a lack of memory here ends
+ * the process: nothing runs yet. */
 void safety_begin(struct task *task);
 void safety_end(void);
 
-/* The calling thread begins to step; or ends to, so that it need not be parked. */
+/* The calling thread begins to step, or stops, so that it need not be parked. */
 void safety_step_begin(void);
 void safety_step_end(void);
 
-/* Make outputs safe, write `text` to stderr and end the process with status 1, none of which can be held up: text that
- * stderr does not take is lost. From any thread. */
+/* Make outputs safe, write `text` to stderr and end the process with status 1. None of this can block: text that stderr
+ * does not accept is lost. From any thread. */
 _Noreturn void safety_abandon(const char *text);
 
-/* All signals that would end or stop the process and may wait until the task ends in order: all but the fatal ones,
+/* All signals that would end or stop the process and can wait for an orderly end of the task: all but the fatal ones,
  * SIGPIPE, which the program ignores, and those that cannot be blocked. */
 void safety_orderly_signals(sigset_t *signals);
 

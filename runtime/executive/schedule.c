@@ -8,7 +8,7 @@
 
 enum { AHEAD = 4 }; /* blocks: a line comes from memory in the time that those take */
 
-/* A block's step, and the ticks that it took; how often is counted in the block. */
+/* A block's step and its duration in ticks. The block counts its steps. */
 struct call {
     int (*step)(struct fl_block *block);
     struct fl_block *block;
@@ -44,11 +44,11 @@ struct schedule *schedule_create(const struct task *task)
     schedule->turns = made(sizeof *schedule->turns * (task->count + 1));
     schedule->count = task->count;
     for (size_t i = 0; i < task->count; i++) {
-        const struct member *member = &task->members[i];
-        schedule->calls[i] = (struct call){.step = member->block->type->step, .block = member->block};
-        if (!i || member->every != member[-1].every || member->offset != member[-1].offset)
+        const struct task_block *task_block = &task->blocks[i];
+        schedule->calls[i] = (struct call){.step = task_block->block->type->step, .block = task_block->block};
+        if (!i || task_block->every != task_block[-1].every || task_block->offset != task_block[-1].offset)
             schedule->turns[schedule->turn_count++] =
-                (struct turn){.every = (uint32_t)member->every, .until = (uint32_t)member->offset};
+                (struct turn){.every = (uint32_t)task_block->every, .until = (uint32_t)task_block->offset};
         schedule->turns[schedule->turn_count - 1].count++;
     }
     schedule->counter = ticks_constant();
@@ -103,7 +103,7 @@ void schedule_report(const struct schedule *schedule, struct task *task)
     for (size_t i = 0; i < schedule->count; i++) {
         const struct call *call = &schedule->calls[i];
         uint64_t count = call->block->step;
-        task->members[i].took = (struct took){
+        task->blocks[i].timing = (struct timing){
             .count = count,
             .mean_ns = llround(count ? unit_ns * (double)call->sum / (double)count : 0),
             .max_ns = llround(unit_ns * (double)call->max),

@@ -1,4 +1,4 @@
-/* How long something took: count, extremes, mean, and a histogram with two buckets an octave. */
+/* Statistics of durations: count, extremes, mean, and a histogram with two buckets an octave. */
 #ifndef FLOTILLA_STATISTICS_H
 #define FLOTILLA_STATISTICS_H
 
@@ -15,7 +15,7 @@ struct statistics {
 
 void statistics_add(struct statistics *statistics, int64_t ns);
 
-/* The time below which `percent` of all lie, at the resolution of the histogram: its bucket's upper bound. */
+/* The duration below which `percent` of all lie, rounded up to the upper bound of its bucket. */
 int64_t statistics_percentile_ns(const struct statistics *statistics, double percent);
 
 /* As a JSON object. */

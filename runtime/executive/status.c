@@ -14,11 +14,11 @@ struct sensor {
     const bool *flag; /* the block's outputs */
     const double *age;
     _Atomic bool put_flag;
-    _Atomic float put_age; /* four bytes are written at once by every processor */
+    _Atomic float put_age; /* every processor writes four bytes atomically */
 };
 
-/* A sequence lock: `turn` is odd while the control thread writes. All it writes has release order, so that whoever
- * reads any of it also sees that turn. */
+/* A sequence lock: `turn` is odd while the control thread writes. All of its writes have release order, so a reader
+ * that sees any of them also sees that `turn`. */
 struct status {
     _Alignas(64) _Atomic uint32_t turn;
     _Atomic int64_t ended_ns;
@@ -42,7 +42,7 @@ struct reading {
 #define PUT(member, value) atomic_store_explicit(&(member), (value), memory_order_release)
 #define GET(member)        atomic_load_explicit(&(member), memory_order_acquire)
 
-/* Number of the first of the three outputs; -1: it is no sensor. */
+/* Index of the first of the three outputs; -1: the block is not a sensor. */
 static int sensor_port(const struct fl_block *block)
 {
     static const struct fl_port wanted[] = {FL_SENSOR_OUTPUTS};
@@ -70,7 +70,7 @@ struct status *status_create(const struct task *task)
     status->begun_ns = fl_now_ns();
     atomic_init(&status->ended_ns, status->begun_ns + FIRST_PERIODS * task->period_ns);
     for (size_t i = 0; i < task->count; i++) {
-        const struct fl_block *block = task->members[i].block;
+        const struct fl_block *block = task->blocks[i].block;
         int port = sensor_port(block);
         if (port >= 0)
             status->sensors[status->count++] =
@@ -115,8 +115,8 @@ int64_t status_ended_ns(const struct status *status)
     return GET(status->ended_ns);
 }
 
-/* To be freed. Again whenever the control thread wrote meanwhile: it does for well under a microsecond of each period.
- */
+/* Copy the state; to be freed. Repeats while the control thread writes, which takes well under a microsecond of each
+ * period. */
 static struct reading *read_status(const struct status *status)
 {
     struct reading *reading = calloc(1, sizeof *reading + status->count * sizeof reading->sensors[0]);

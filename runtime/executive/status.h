@@ -1,32 +1,33 @@
-/* How a running task does, for whoever asks: its control thread writes, others read, and neither waits for the other.
+/* The state of a running task: the control thread writes it, others read it, and neither waits for the other.
  *
- * What is read is as of the end of one step. As JSON, one line:
+ * A reading is as of the end of one step. As JSON, one line:
  *
  *     {"task": "heading", "period_s": 0.01, "running_s": 75.21, "steps": 7521, "overruns": 3, "skipped": 4,
  *      "timeouts": 0, "last_overrun": {"step": 5000, "ago_s": 25.2, "late_s": 0.0012},
  *      "sensors": {"gyro": {"flag": true, "age_s": 0.004}}}
  *
- *   running_s     since the first step was prepared: all counts begin there, and end with the task
- *   overruns      steps that ended after the next one was due; `skipped` releases were left out because of them
- *   timeouts      steps for which the task's trigger had nothing
- *   last_overrun  null: there was none; `late_s`: how long after the next one was due its step ended
+ *   running_s     since the first step was prepared; all counts begin there
+ *   overruns      steps that ended after the next one was due; they led to `skipped` releases without a step
+ *   timeouts      steps without a trigger event
+ *   last_overrun  null: there was none; `late_s`: how long after the next one was due the step ended
  *   sensors       all blocks with the outputs that flotilla/sensor.h defines, of plug-ins too
  */
 #ifndef FLOTILLA_STATUS_H
 #define FLOTILLA_STATUS_H
 
-#include "executive.h"
+#include "run.h"
+#include "task.h"
 
 struct status;
 
 struct status *status_create(const struct task *task);
 void status_destroy(struct status *status); /* NULL is allowed */
 
-/* After each step, which ended at `now_ns`, by the control thread, in real time: the counts of `result`, and the
- * sensors' outputs. */
+/* For the control thread, after each step, which ended at `now_ns`, in real time: store the counts of `result` and the
+ * outputs of the sensors. */
 void status_put(struct status *status, const struct run_result *result, int64_t now_ns);
 
-/* Steps done, and when the last one ended, CLOCK_MONOTONIC; before the first: when it is to be expected. */
+/* Steps done, and when the last one ended (CLOCK_MONOTONIC); before the first step: when it is expected. */
 uint64_t status_steps(const struct status *status);
 int64_t status_ended_ns(const struct status *status);
 

@@ -36,7 +36,7 @@ static void *grown(void *memory, size_t bytes)
 
 static void make_block(struct building *building, struct registry *registry, const struct block_entry *entry)
 {
-    struct member *member = &building->task->members[building->task->count];
+    struct task_block *task_block = &building->task->blocks[building->task->count];
     const struct fl_block_type *type = entry->type ? registry_find(registry, entry->type) : NULL;
     if (!type) {
         const char *nearest = entry->type ? registry_nearest(registry, entry->type) : NULL;
@@ -47,7 +47,7 @@ static void make_block(struct building *building, struct registry *registry, con
     }
     struct fl_block *block = block_create(type, entry->name);
     unsigned before = building->problems->count;
-    *member = (struct member){.block = block, .every = entry->every, .offset = entry->offset};
+    *task_block = (struct task_block){.block = block, .every = entry->every, .offset = entry->offset};
     building->task->count++;
     block->period_ns = building->file->period_ns * entry->every;
     block->service->priority = building->task->priority ? building->task->priority - 1 : 0;
@@ -55,8 +55,8 @@ static void make_block(struct building *building, struct registry *registry, con
     parameters_set(block, entry->parameters, entry->parameter_count, entry->line, building->problems);
     if (building->problems->count == before && type->configure && type->configure(block) != FL_OK)
         problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
-    member->wrong = building->problems->count != before;
-    member->incomplete = type->configure && building->problems->count != before;
+    task_block->wrong = building->problems->count != before;
+    task_block->incomplete = type->configure && building->problems->count != before;
     if (block_make_signals(block) != FL_OK)
         problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
 }
@@ -74,8 +74,8 @@ static const struct fl_device *device_of(const struct fl_block *block)
     return NULL;
 }
 
-/* What device_write() writes, to be freed; NULL: the block has no device. */
-static char *written_device(const struct fl_block *block)
+/* The output of device_write(), to be freed; NULL: the block has no device. */
+static char *device_text(const struct fl_block *block)
 {
     char *text = NULL;
     size_t size = 0;
@@ -92,7 +92,7 @@ static char *written_device(const struct fl_block *block)
 static bool same_device(const struct fl_block *a, const char *of_a, const struct fl_block *b, const char *of_b)
 {
     const struct fl_device *one = device_of(a), *other = device_of(b);
-    if (one && other) /* of whatever types */
+    if (one && other) /* blocks of any types */
         return one->path && other->path && strcmp(one->path, other->path) == 0;
     return a->type == b->type && of_a && of_b && strcmp(of_a, of_b) == 0;
 }
@@ -103,13 +103,13 @@ static void check_devices(struct building *building)
     const struct task *task = building->task;
     char **devices = grown(NULL, sizeof *devices * (task->count + 1));
     for (size_t i = 0; i < task->count; i++) {
-        const struct fl_block *later = task->members[i].block;
-        devices[i] = task->members[i].wrong ? NULL : written_device(later);
+        const struct fl_block *later = task->blocks[i].block;
+        devices[i] = task->blocks[i].wrong ? NULL : device_text(later);
         for (size_t j = 0; j < i; j++) {
-            const struct fl_block *earlier = task->members[j].block;
+            const struct fl_block *earlier = task->blocks[j].block;
             if (same_device(later, devices[i], earlier, devices[j]))
                 problem(building->problems, building->file->blocks[i].line,
-                        "block %s: %s is block %s's; a device serves one block", later->name, devices[i],
+                        "block %s: %s is block %s's; only one block may use a device", later->name, devices[i],
                         earlier->name);
         }
     }
@@ -123,7 +123,7 @@ static void check_devices(struct building *building)
 static struct fl_block *block_named(const struct task *task, const char *name, size_t length, size_t *index)
 {
     for (size_t i = 0; i < task->count; i++) {
-        struct fl_block *block = task->members[i].block;
+        struct fl_block *block = task->blocks[i].block;
         if (strlen(block->name) == length && memcmp(block->name, name, length) == 0) {
             if (index)
                 *index = i;
@@ -199,7 +199,7 @@ const void *task_signal(const struct task *task, const char *name, enum fl_type 
     *(c_type *)place = (c_type)integer;                                                                                \
     return true
 
-/* A constant into a signal of some type; false where the type has no such value. */
+/* Store a constant in a signal; false where the type has no such value. */
 static bool put_constant(const char *text, enum fl_type type, void *place)
 {
     int64_t integer;
@@ -229,70 +229,69 @@ static bool put_constant(const char *text, enum fl_type type, void *place)
         *(uint64_t *)place = count;
         return true;
     case FL_SINGLE:
-        if (!read_real(text, &real))
+        if (!read_double(text, &real))
             return false;
         *(float *)place = (float)real;
         return true;
     case FL_DOUBLE:
-        return read_real(text, place);
+        return read_double(text, place);
     case FL_TYPES:
         break;
     }
     return false;
 }
 
-/* Whether a text is meant as a constant: numbers and truth values, which no block's name looks like. */
+/* Whether a string is a constant: a number, true or false. No name of a block looks like these. */
 static bool is_constant(const char *text)
 {
     return strchr("0123456789+-.", *text) || strcmp(text, "true") == 0 || strcmp(text, "false") == 0;
 }
 
 static void wire_constants(struct building *building, struct fl_block *block, uint32_t port,
-                           const struct written *written)
+                           const struct raw_value *raw)
 {
     const struct fl_port *to = &block->in_ports[port];
     size_t size = fl_type_size(to->type);
     char *place = (char *)(uintptr_t)block->in[port];
     block_wire(block, port, place); /* to itself */
-    if (written->count != to->width) {
-        problem(building->problems, written->line, "block %s: input %s has %u elements, not %zu", block->name, to->name,
-                (unsigned)to->width, written->count);
+    if (raw->count != to->width) {
+        problem(building->problems, raw->line, "block %s: input %s has %u elements, not %zu", block->name, to->name,
+                (unsigned)to->width, raw->count);
         return;
     }
-    for (size_t i = 0; i < written->count; i++)
-        if (!put_constant(written->text[i], to->type, place + i * size))
-            problem(building->problems, written->line, "block %s: input %s: %s is not a %s", block->name, to->name,
-                    written->text[i], fl_type_name(to->type));
+    for (size_t i = 0; i < raw->count; i++)
+        if (!put_constant(raw->text[i], to->type, place + i * size))
+            problem(building->problems, raw->line, "block %s: input %s: %s is not a %s", block->name, to->name,
+                    raw->text[i], fl_type_name(to->type));
 }
 
-static void wire_input(struct building *building, size_t index, uint32_t port, const struct written *written)
+static void wire_input(struct building *building, size_t index, uint32_t port, const struct raw_value *raw)
 {
     char reason[256];
     enum fl_type type;
     uint32_t width;
     size_t source = index;
-    struct fl_block *block = building->task->members[index].block;
+    struct fl_block *block = building->task->blocks[index].block;
     const struct fl_port *to = &block->in_ports[port];
-    if (written->list || !written->count || is_constant(written->text[0])) {
-        wire_constants(building, block, port, written);
+    if (raw->list || !raw->count || is_constant(raw->text[0])) {
+        wire_constants(building, block, port, raw);
         return;
     }
-    const void *signal = find_signal(building->task, written->text[0], &source, &type, &width, reason, sizeof reason);
-    if (building->task->members[source].incomplete)
-        return; /* told already */
+    const void *signal = find_signal(building->task, raw->text[0], &source, &type, &width, reason, sizeof reason);
+    if (building->task->blocks[source].incomplete)
+        return; /* already reported */
     if (!signal) {
-        problem(building->problems, written->line, "block %s: input %s: %s", block->name, to->name, reason);
+        problem(building->problems, raw->line, "block %s: input %s: %s", block->name, to->name, reason);
         return;
     }
     if (type != to->type || width != to->width) {
-        problem(building->problems, written->line, "block %s: input %s takes %s[%u], %s is %s[%u]", block->name,
-                to->name, fl_type_name(to->type), (unsigned)to->width, written->text[0], fl_type_name(type),
-                (unsigned)width);
+        problem(building->problems, raw->line, "block %s: input %s takes %s[%u], %s is %s[%u]", block->name, to->name,
+                fl_type_name(to->type), (unsigned)to->width, raw->text[0], fl_type_name(type), (unsigned)width);
         return;
     }
     block_wire(block, port, signal);
     if (to->flags & FL_DELAYED && source == index)
-        return; /* its own value of the step before, whatever the order */
+        return; /* a block that reads its own output of the step before needs no order */
     building->edges = grown(building->edges, sizeof *building->edges * (building->edge_count + 1));
     building->edges[building->edge_count++] =
         to->flags & FL_DELAYED ? (struct edge){index, source} : (struct edge){source, index};
@@ -301,35 +300,35 @@ static void wire_input(struct building *building, size_t index, uint32_t port, c
 static void wire_block(struct building *building, size_t index, const struct block_entry *entry)
 {
     char known[160];
-    const struct fl_block *block = building->task->members[index].block;
-    if (building->task->members[index].incomplete)
+    const struct fl_block *block = building->task->blocks[index].block;
+    if (building->task->blocks[index].incomplete)
         return;
     for (uint32_t port = 0; port < block->in_count; port++) {
         const struct fl_port *to = &block->in_ports[port];
-        const struct written *written = NULL;
-        for (size_t i = 0; i < entry->input_count && !written; i++)
+        const struct raw_value *raw = NULL;
+        for (size_t i = 0; i < entry->input_count && !raw; i++)
             if (strcmp(entry->inputs[i].name, to->name) == 0)
-                written = &entry->inputs[i];
-        if (written)
-            wire_input(building, index, port, written);
+                raw = &entry->inputs[i];
+        if (raw)
+            wire_input(building, index, port, raw);
         else if (!(to->flags & FL_OPTIONAL))
             problem(building->problems, entry->line, "block %s: input %s has no wire: %s", block->name, to->name,
                     to->summary ? to->summary : "it needs one");
     }
     for (size_t i = 0; i < entry->input_count; i++) {
-        const struct written *written = &entry->inputs[i];
-        if (port_named(block->in_ports, block->in_count, written->name, strlen(written->name)) < 0) {
+        const struct raw_value *raw = &entry->inputs[i];
+        if (port_named(block->in_ports, block->in_count, raw->name, strlen(raw->name)) < 0) {
             list_ports(block->in_ports, block->in_count, known, sizeof known);
-            problem(building->problems, written->line, "block %s: %s has no input %s; it has %s", block->name,
-                    block->type->name, written->name, known);
+            problem(building->problems, raw->line, "block %s: %s has no input %s; it has %s", block->name,
+                    block->type->name, raw->name, known);
         }
     }
 }
 
 /* --- order --- */
 
-/* Name a loop among the blocks that are left: walk against the edges until a block comes again. */
-static void tell_cycle(struct building *building, const bool *done)
+/* Find a loop among the blocks that are left: follow the edges backwards until a block comes again. */
+static void report_cycle(struct building *building, const bool *done)
 {
     char loop[512] = "";
     const struct task *task = building->task;
@@ -348,7 +347,7 @@ static void tell_cycle(struct building *building, const bool *done)
         seen[at] = true;
         if (closing) {
             char longer[sizeof loop];
-            snprintf(longer, sizeof longer, "%.100s%s%.380s", task->members[at].block->name, *loop ? " → " : "", loop);
+            snprintf(longer, sizeof longer, "%.100s%s%.380s", task->blocks[at].block->name, *loop ? " → " : "", loop);
             memcpy(loop, longer, sizeof loop);
         }
         for (size_t e = 0; e < building->edge_count; e++) {
@@ -359,16 +358,16 @@ static void tell_cycle(struct building *building, const bool *done)
         }
     }
     problem(building->problems, building->file->blocks[at].line,
-            "cycle without delay: %s → %s; put a block delay into one of its wires", task->members[at].block->name,
+            "cycle without delay: %s → %s; put a block delay into one of its wires", task->blocks[at].block->name,
             loop);
     free(seen);
 }
 
-/* Sources first; where that leaves a choice, as in the file. */
+/* Order the blocks: sources first, otherwise as in the file. */
 static void order(struct building *building)
 {
     struct task *task = building->task;
-    struct member *ordered = grown(NULL, sizeof *ordered * (task->count + 1));
+    struct task_block *ordered = grown(NULL, sizeof *ordered * (task->count + 1));
     bool *done = grown(NULL, task->count + 1);
     memset(done, 0, task->count + 1);
     for (size_t placed = 0; placed < task->count; placed++) {
@@ -381,17 +380,17 @@ static void order(struct building *building)
                 break;
         }
         if (next == task->count) {
-            tell_cycle(building, done);
+            report_cycle(building, done);
             free(ordered);
             free(done);
             return;
         }
         done[next] = true;
-        ordered[placed] = task->members[next];
+        ordered[placed] = task->blocks[next];
     }
     free(done);
-    free(task->members);
-    task->members = ordered;
+    free(task->blocks);
+    task->blocks = ordered;
 }
 
 /* --- trigger --- */
@@ -401,16 +400,16 @@ static void find_trigger(struct building *building)
     const struct task_file *file = building->file;
     struct task *task = building->task;
     for (size_t i = 0; file->trigger && i < task->count && !task->trigger; i++)
-        if (strcmp(task->members[i].block->name, file->trigger) == 0)
-            task->trigger = task->members[i].block;
+        if (strcmp(task->blocks[i].block->name, file->trigger) == 0)
+            task->trigger = task->blocks[i].block;
     if (!file->trigger)
         return;
     if (!task->trigger)
         problem(building->problems, file->trigger_line, "trigger: there is no block %s", file->trigger);
     else if (!task->trigger->type->await)
         problem(building->problems, file->trigger_line,
-                "trigger: %s, a %s, waits for nothing; one that does is udp-receive", file->trigger,
-                task->trigger->type->name);
+                "trigger: block %s is a %s, which cannot trigger a task; use a block that can, such as udp-receive",
+                file->trigger, task->trigger->type->name);
     for (size_t i = 0; i < file->count; i++)
         if (strcmp(file->blocks[i].name, file->trigger) == 0 && file->blocks[i].every > 1)
             problem(building->problems, file->blocks[i].line, "block %s: the trigger runs in every step",
@@ -442,10 +441,10 @@ void task_build(struct task *task, struct registry *registry, struct problems *p
     task->overruns = file.overruns;
     task->overrun = file.overrun;
     task->priority = (int)file.priority;
-    task->members = grown(NULL, sizeof *task->members * (file.count + 1));
+    task->blocks = grown(NULL, sizeof *task->blocks * (file.count + 1));
     for (size_t i = 0; i < file.count; i++)
         make_block(&building, registry, &file.blocks[i]);
-    if (task->count == file.count) { /* otherwise every wire of what is missing would be a further message */
+    if (task->count == file.count) { /* otherwise each wire of a missing block would add a message */
         for (size_t i = 0; i < file.count; i++)
             wire_block(&building, i, &file.blocks[i]);
         check_devices(&building);
@@ -460,8 +459,8 @@ void task_build(struct task *task, struct registry *registry, struct problems *p
 void task_free(struct task *task)
 {
     for (size_t i = 0; i < task->count; i++)
-        block_destroy(task->members[i].block);
-    free(task->members);
+        block_destroy(task->blocks[i].block);
+    free(task->blocks);
     free(task->name);
     *task = (struct task){0};
 }
@@ -484,7 +483,7 @@ int64_t task_actuator_timeout(const struct task *task)
 {
     int64_t shortest_ns = INT64_MAX;
     for (size_t i = 0; i < task->count; i++) {
-        int64_t timeout_ns = actuator_timeout(task->members[i].block);
+        int64_t timeout_ns = actuator_timeout(task->blocks[i].block);
         shortest_ns = timeout_ns < shortest_ns ? timeout_ns : shortest_ns;
     }
     return shortest_ns;
@@ -493,7 +492,7 @@ int64_t task_actuator_timeout(const struct task *task)
 static void write_edge(const struct task *task, const struct fl_block *to, uint32_t input, FILE *out)
 {
     for (size_t i = 0; i < task->count; i++) {
-        const struct fl_block *from = task->members[i].block;
+        const struct fl_block *from = task->blocks[i].block;
         for (uint32_t port = 0; port < from->out_count; port++) {
             const char *start = from->out[port], *at = to->in[input];
             size_t size = fl_type_size(from->out_ports[port].type);
@@ -513,14 +512,15 @@ void task_write_dot(const struct task *task, FILE *out)
 {
     fprintf(out, "digraph \"%s\" {\n  rankdir=LR;\n  node [shape=box];\n", task->name);
     for (size_t i = 0; i < task->count; i++) {
-        const struct member *member = &task->members[i];
-        fprintf(out, "  \"%s\" [label=\"%s\\n%s", member->block->name, member->block->name, member->block->type->name);
-        if (member->every > 1)
-            fprintf(out, "\\nevery %lld", (long long)member->every);
+        const struct task_block *task_block = &task->blocks[i];
+        fprintf(out, "  \"%s\" [label=\"%s\\n%s", task_block->block->name, task_block->block->name,
+                task_block->block->type->name);
+        if (task_block->every > 1)
+            fprintf(out, "\\nevery %lld", (long long)task_block->every);
         fprintf(out, "\"];\n");
     }
     for (size_t i = 0; i < task->count; i++)
-        for (uint32_t port = 0; port < task->members[i].block->in_count; port++)
-            write_edge(task, task->members[i].block, port, out);
+        for (uint32_t port = 0; port < task->blocks[i].block->in_count; port++)
+            write_edge(task, task->blocks[i].block, port, out);
     fprintf(out, "}\n");
 }

@@ -5,15 +5,15 @@
 #include "registry.h"
 #include "task_file.h"
 
-struct took {
+struct timing {
     uint64_t count; /* of steps */
     int64_t mean_ns, max_ns;
 };
 
-struct member {
+struct task_block {
     struct fl_block *block;
     int64_t every, offset;
-    struct took took;     /* by its steps, after a run */
+    struct timing timing; /* of its steps, after a run */
     bool started, failed; /* `failed`: its start */
     bool wrong;           /* its parameters */
     bool incomplete;      /* its ports are not known, because its parameters are wrong */
@@ -24,13 +24,13 @@ struct task {
     int64_t period_ns, phase_ns, overruns;
     int priority;
     enum overrun overrun;
-    struct fl_block *trigger; /* steps are due when it has something new; NULL: by the clock */
-    struct member *members;   /* in the order of execution */
+    struct fl_block *trigger;  /* a step is due when this block has new input */
+    struct task_block *blocks; /* in the order of execution */
     size_t count;
 };
 
-/* Build the task of `problems->file`. All that is wrong goes to `problems`; what is built is usable when there was
- * nothing. Opens no device. */
+/* Build the task of `problems->file`. All problems go to `problems`; without any the task is usable. Opens no device.
+ */
 void task_build(struct task *task, struct registry *registry, struct problems *problems);
 void task_free(struct task *task);
 

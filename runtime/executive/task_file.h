@@ -1,15 +1,15 @@
-/* A task file as it is written: what YAML says, with lines, not yet compared with the blocks that exist.
+/* A task file as read from YAML, with line numbers, before it is compared with the known blocks.
  *
  *     period: 10 ms            # ns, us, ms, s
  *     phase: 500 us            # steps are due this long after each multiple of the period; see task_file.c
- *     trigger: gyro            # steps are due when this block has something new; the period is how often that is
+ *     trigger: gyro            # a step is due when this block has new input; period is then the expected interval
  *     priority: 80             # SCHED_FIFO, 2 to 98; 0: ordinary scheduling
- *     overrun: skip            # what follows a step that ends after the next one was due: skip, catch-up, stop-safe
- *     overruns: 10             # that many in a row lead to the safe state; 0: never
+ *     overrun: skip            # after a step that ends when the next one was already due: skip, catch-up, stop-safe
+ *     overruns: 10             # so many overruns in a row lead to the safe state; 0: never
  *     blocks:
  *       gyro:
  *         type: dsp3000
- *         every: 1             # runs in each n-th step of the task ...
+ *         every: 1             # runs in every Nth step of the task ...
  *         offset: 0            # ... beginning with this one
  *         in: {in: other.out}  # "block.port", one element of it "block.port[2]", or constants
  *         parameters: {device: /dev/robot/gyro}
@@ -21,15 +21,16 @@
 #include "problem.h"
 
 #include <stdint.h>
+#include <stdio.h>
 #include <yaml.h>
 
-enum overrun { OVERRUN_SKIP, OVERRUN_CATCH_UP, OVERRUN_STOP_SAFE };
+enum overrun { OVERRUN_SKIP, OVERRUN_CATCH_UP, OVERRUN_STOP_SAFE }; /* the order of the key's choices */
 
 struct block_entry {
     const char *name, *type;
     unsigned line;
     int64_t every, offset;
-    struct written *inputs, *parameters; /* an input's texts are its sources */
+    struct raw_value *inputs, *parameters; /* an input's strings name its sources */
     size_t input_count, parameter_count;
 };
 
@@ -40,11 +41,17 @@ struct task_file {
     unsigned trigger_line;
     struct block_entry *blocks; /* in the order of the file */
     size_t count;
-    yaml_document_t document; /* owns the texts */
+    yaml_document_t document; /* owns the strings */
 };
 
 /* Read `problems->file`; what is wrong with it goes to `problems`. Free it in any case. */
 void task_file_read(struct task_file *task, struct problems *problems);
 void task_file_free(struct task_file *task);
+
+/* Write the keys that a file may have as JSON: a list of objects with `key`, dotted from the file's top, `value`
+ * (time, integer, choice, name, mapping), `meaning`, and those that apply of `min`, `max`, `choices` (separated by
+ * '|'), `default`, and `otherwise`, which is what holds without the key where that is no value. A key with neither of
+ * the latter two is required. */
+void task_file_write_keys(FILE *out);
 
 #endif

@@ -13,7 +13,8 @@ static bool invariant(void)
     return __get_cpuid(0x80000007, &a, &b, &c, &d) && d & 1u << 8;
 }
 
-/* The kernel watches the counter it keeps time by, and leaves it when it strays: so older processors have one, too. */
+/* The kernel checks the counter that it uses as its clock, and stops using it when it drifts. So this also covers older
+ * processors. */
 static bool keeps_time(void)
 {
     char name[16] = "";

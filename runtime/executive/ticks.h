@@ -1,7 +1,7 @@
-/* A clock for what a block takes: the processor's time stamp counter, which costs a third of a call for the time.
+/* A clock for the timing of blocks: the processor's time stamp counter, which costs a third of a system clock reading.
  *
- * What it counts is known only at the end: two readings of it beside CLOCK_MONOTONIC, as far apart as the run is long,
- * make its unit. Where the counter cannot be trusted, ticks are nanoseconds of CLOCK_MONOTONIC.
+ * The counter's unit is computed at the end, from two readings of it beside CLOCK_MONOTONIC at the begin and the end of
+ * the run. Where the counter is not reliable, ticks are nanoseconds of CLOCK_MONOTONIC.
  */
 #ifndef FLOTILLA_TICKS_H
 #define FLOTILLA_TICKS_H
@@ -17,10 +17,12 @@ struct moment {
     int64_t ticks, ns;
 };
 
-/* Whether the counter goes at one rate: the kernel keeps time by it, or the processor says so. */
+/* Whether the counter runs at a constant rate: the kernel uses it as its clock, or the processor reports it as
+ * invariant. */
 bool ticks_constant(void);
 
-/* Now; `counter` as ticks_constant() says. Not serialised: what is measured is moved by some instructions, not lost. */
+/* The current time in ticks; `counter` is the result of ticks_constant(). The reading is not serialised, so a boundary
+ * between blocks may move by some instructions. */
 static inline int64_t ticks_now(bool counter)
 {
 #if defined(__x86_64__) || defined(__i386__)

@@ -20,8 +20,8 @@
 enum {
     REQUEST_BYTES = 512,
     REASON_BYTES = 512,
-    CLIENT_MS = 2000, /* for its request to come, and for the answer to leave */
-    QUEUED = 16,      /* connections that wait for their turn */
+    CLIENT_MS = 2000, /* for a request to arrive, and for an answer to leave */
+    QUEUED = 16,      /* connections waiting to be served */
     FOR_EVER = -1,
 };
 
@@ -62,8 +62,8 @@ static int64_t deadline_in(int64_t milliseconds)
     return fl_now_ns() + milliseconds * MILLISECOND_NS;
 }
 
-/* Until any of `waiting` from the second on is ready; the first is the tuner's. False at the deadline (FOR_EVER: none)
- * and when the task ends. */
+/* Wait until one of `waiting`, from the second on, is ready; the first is the tuner's own. False at the deadline
+ * (FOR_EVER: none) and when the task ends. */
 static bool await(const struct tuner *tuner, struct pollfd *waiting, nfds_t count, int64_t deadline_ns)
 {
     waiting[0] = (struct pollfd){.fd = tuner->stop_fd, .events = POLLIN};
@@ -85,13 +85,13 @@ static struct fl_block *find_block(const struct tuner *tuner, struct client *cli
 {
     const struct task *task = tuner->task;
     for (size_t i = 0; i < task->count; i++)
-        if (strcmp(task->members[i].block->name, name) == 0)
-            return task->members[i].block;
+        if (strcmp(task->blocks[i].block->name, name) == 0)
+            return task->blocks[i].block;
     refuse(client, "the task has no block %s; it has ", name);
     for (size_t i = 0; i < task->count; i++) {
         size_t used = strlen(client->reason);
         snprintf(client->reason + used, sizeof client->reason - used, "%s%s", i ? ", " : "",
-                 task->members[i].block->name);
+                 task->blocks[i].block->name);
     }
     return NULL;
 }
@@ -115,19 +115,19 @@ static const struct fl_parameter *find(const struct tuner *tuner, struct client 
     return parameter;
 }
 
-/* The control thread copies what is small and owns nothing. */
+/* Only small values without memory of their own can be handed to the control thread. */
 static bool tunable(const struct fl_parameter *parameter)
 {
     enum fl_kind kind = parameter->kind;
     bool plain = kind == FL_KIND_BOOLEAN || kind == FL_KIND_INTEGER || kind == FL_KIND_UNSIGNED ||
-                 kind == FL_KIND_REAL || kind == FL_KIND_CHOICE;
+                 kind == FL_KIND_DOUBLE || kind == FL_KIND_CHOICE;
     return plain && parameter->flags & FL_TUNABLE;
 }
 
 static bool list(const struct tuner *tuner, struct client *client)
 {
     for (size_t i = 0; i < tuner->task->count; i++) {
-        const struct fl_block *block = tuner->task->members[i].block;
+        const struct fl_block *block = tuner->task->blocks[i].block;
         for (uint32_t p = 0; p < block->type->parameter_count; p++) {
             const struct fl_parameter *parameter = &block->type->parameters[p];
             bool unit = parameter->unit && *parameter->unit, limits = parameter->min != parameter->max;
@@ -157,8 +157,7 @@ static bool get(const struct tuner *tuner, struct client *client, char *name)
     return true;
 }
 
-/* Whether the task file could have said so, and the value that it means: on a block that is like this one, but never
- * starts. */
+/* Check and read a value as the task file would, on a copy of the block that is never started. */
 static bool judge(struct client *client, const struct fl_block *block, const struct fl_parameter *parameter,
                   const char *text, void *value)
 {
@@ -168,8 +167,8 @@ static bool judge(struct client *client, const struct fl_block *block, const str
     void *parameters = (void *)(uintptr_t)like->parameters;
     memcpy(parameters, block->parameters, type->parameters_size);
     like->period_ns = block->period_ns;
-    bool good =
-        parameter_set(like, parameter, parameters, &(struct written){.count = 1, .text = &text}, reason, sizeof reason);
+    bool good = parameter_set(like, parameter, parameters, &(struct raw_value){.count = 1, .text = &text}, reason,
+                              sizeof reason);
     if (!good) {
         refuse(client, "block %s: parameter %s: %s", block->name, parameter->name, reason);
     } else if (type->configure && type->configure(like) != FL_OK) {
@@ -181,8 +180,8 @@ static bool judge(struct client *client, const struct fl_block *block, const str
     return good;
 }
 
-/* Until the control thread has taken what is offered. False, and it never will: when it makes no step, and when there
- * is nobody any more who could be told. */
+/* Wait until the control thread has taken the offered value. False when it never will: the task does not step, or the
+ * client has gone. */
 static bool await_taken(struct tuner *tuner, struct client *client, uint64_t *step)
 {
     int64_t deadline_ns = fl_now_ns() + 2 * tuner->task->period_ns + CLIENT_MS * MILLISECOND_NS;
@@ -194,7 +193,7 @@ static bool await_taken(struct tuner *tuner, struct client *client, uint64_t *st
         if (ready && !waiting[2].revents)
             continue;
         if (change_withdraw(&tuner->change))
-            return refuse(client, "the task makes no step; nothing is changed");
+            return refuse(client, "the task does not step, so nothing was changed");
         poll(&waiting[1], 1, -1); /* it is being taken at this moment */
     }
 }
@@ -223,7 +222,7 @@ static bool set(struct tuner *tuner, struct client *client, char *name, const ch
     return true;
 }
 
-static bool tell_status(const struct tuner *tuner, struct client *client, bool json)
+static bool send_status(const struct tuner *tuner, struct client *client, bool json)
 {
     status_write(tuner->status, json, client->answer);
     return true;
@@ -239,8 +238,9 @@ static bool obey(struct tuner *tuner, struct client *client)
     if (strcmp(verb, "set") == 0 && name && rest)
         return set(tuner, client, name, rest);
     if (strcmp(verb, "status") == 0 && (!name || (strcmp(name, "json") == 0 && !rest)))
-        return tell_status(tuner, client, name);
-    return refuse(client, "there is: list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, status json");
+        return send_status(tuner, client, name);
+    return refuse(
+        client, "unknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, status json");
 }
 
 /* --- clients --- */
@@ -311,7 +311,7 @@ static void *serve(void *argument)
         struct ucred peer = {.uid = (uid_t)-1};
         struct client client = {.fd = accept4(tuner->listen_fd, NULL, NULL, SOCK_CLOEXEC)};
         if (client.fd < 0) {
-            if (errno != EAGAIN) /* no descriptor is left, or no memory: that may pass */
+            if (errno != EAGAIN) /* no descriptor or no memory is left, which may pass */
                 await(tuner, waiting, 1, deadline_in(CLIENT_MS));
             continue;
         }
@@ -325,7 +325,7 @@ static void *serve(void *argument)
 
 /* --- its life --- */
 
-/* Whether a socket is there that nobody listens at any more. */
+/* Whether there is a socket at the path to which nobody listens any more. */
 static bool left_behind(const struct sockaddr_un *address)
 {
     struct stat file;
@@ -369,7 +369,7 @@ struct tuner *tuner_create(const char *path, struct task *task)
     tuner->listen_fd = listening(path);
     if (tuner->listen_fd < 0) {
         fprintf(stderr, "flotilla: %s: %s: parameters cannot be set while it runs\n", path,
-                errno == EADDRINUSE ? "it is there already, and is another task's or no socket" : strerror(errno));
+                errno == EADDRINUSE ? "it exists, and is another task's socket or not a socket" : strerror(errno));
         free(tuner->path);
         free(tuner);
         return NULL;

@@ -13,28 +13,28 @@ enum { SETTINGS = 32, ELEMENTS = 64, PERIOD_NS = 10 * 1000 * 1000 };
 
 static char said[4096];
 
-static struct written setting(const char *name, const char *value)
+static struct raw_value setting(const char *name, const char *value)
 {
     char *copy = strdup(value), *rest = copy;
-    struct written written = {.name = name, .line = 1, .list = strchr(value, ',') != NULL};
-    written.text = calloc(ELEMENTS, sizeof(char *));
-    for (char *element; (element = strsep(&rest, ",")) && written.count < ELEMENTS;)
-        written.text[written.count++] = strdup(element);
+    struct raw_value raw = {.name = name, .line = 1, .list = strchr(value, ',') != NULL};
+    raw.text = calloc(ELEMENTS, sizeof(char *));
+    for (char *element; (element = strsep(&rest, ",")) && raw.count < ELEMENTS;)
+        raw.text[raw.count++] = strdup(element);
     free(copy);
-    return written;
+    return raw;
 }
 
-static void forget(struct written *written)
+static void forget(struct raw_value *raw)
 {
-    for (size_t i = 0; i < written->count; i++)
-        free((char *)(uintptr_t)written->text[i]);
-    free(written->text);
+    for (size_t i = 0; i < raw->count; i++)
+        free((char *)(uintptr_t)raw->text[i]);
+    free(raw->text);
 }
 
 static struct fl_block *make(const char *type, va_list arguments)
 {
     struct registry registry = {0};
-    struct written settings[SETTINGS];
+    struct raw_value settings[SETTINGS];
     size_t count = 0;
     FILE *out = fmemopen(said, sizeof said, "w");
     struct problems problems = {.file = "task", .out = out};

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from flotilla.common.errors import UserError
 from images.builder.bench import Row, mkosi_program, table
-from images.builder.errors import UserError
 
 
 def test_table_has_ratios_to_the_first_row() -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from flotilla.common.errors import UserError
 from images.builder.bmap import BLOCK, BlockMap, Range, bmap_of, read_bmap, write_bmap
-from images.builder.errors import UserError
 
 BLOCKS = 64
 CONTENT = random.Random(3).randbytes(BLOCKS * BLOCK)

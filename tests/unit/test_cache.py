@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from images.builder import cache, paths
+from flotilla.common import cache, paths, progress
+
+PATIENCE_S = 60
 
 
 @pytest.fixture(autouse=True)
@@ -181,3 +184,26 @@ def test_what_is_being_made_is_left_alone() -> None:
 
     cache.result("root", f"{99:016}", unpack)
     assert left == [True]
+
+
+def test_who_waits_says_for_what(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Seen to fail when a second build showed nothing until the first one ended."""
+    lock = tmp_path / "lock"
+    entered = threading.Event()
+
+    def second() -> None:
+        with cache.locked(lock):
+            entered.set()
+
+    waiting = threading.Thread(target=second)
+    with cache.locked(lock):
+        waiting.start()
+        end = time.monotonic() + PATIENCE_S
+        while not progress._running:
+            assert waiting.is_alive()
+            assert time.monotonic() < end, "it waits without a word"
+        assert "wait for another command that holds" in progress._running[-1].title
+        assert not entered.is_set()
+    waiting.join()
+    assert entered.is_set()
+    assert "wait for another command that holds" in capfd.readouterr().err

@@ -34,7 +34,7 @@ def test_identical_content_beside_holes_is_identical(tmp_path: Path) -> None:
     content = bytes(range(256)) * 600
     for name in ("1", "2"):
         with image(tmp_path / name).open("r+b") as file:
-            for offset in (0, card.BOOT.start, card.SLOTS[0].start + 3000):
+            for offset in (0, card.STATE.start, card.SLOTS[0].start + 3000):
                 file.seek(offset)
                 file.write(content)
     assert compare.differing_parts(tmp_path / "1", tmp_path / "2") == []
@@ -46,8 +46,8 @@ def test_identical_content_beside_holes_is_identical(tmp_path: Path) -> None:
         (0, "MBR", 0),
         (511, "MBR", 511),
         (512, "GRUB's core image", 0),
-        (card.BOOT.start - 1, "GRUB's core image", card.BOOT.start - 513),
-        (card.BOOT.start, "boot partition", 0),
+        (card.STATE.start - 1, "GRUB's core image", card.STATE.start - 513),
+        (card.STATE.start, "boot state", 0),
         (card.SLOTS[0].start + 5_000_000, "slot A", 5_000_000),
         (card.SLOTS[1].start + card.SLOTS[1].size - 1, "slot B", card.SLOTS[1].size - 1),
         (card.DATA.start, "data partition", 0),

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from images.builder.errors import UserError
-from tests.latency.results import Latency
-from tests.scenarios import __main__ as command
-from tests.scenarios import crowd, report, virtual
+from flotilla.common.errors import UserError
+from lab.latency.results import Latency
+from lab.scenarios import command, crowd, report, virtual
 
 
 @pytest.mark.parametrize("size", crowd.SIZES)
@@ -38,7 +37,7 @@ def test_each_loop_is_its_own(size: int, tmp_path: Path) -> None:
 
 def test_a_size_that_is_none_is_refused() -> None:
     with pytest.raises(UserError, match=r"1 robots: give 2, 4, 8, 16, and all up to that"):
-        command.crowds(1)
+        command.crowds(1, virtual.fleet("udp").board())
 
 
 def test_the_page_has_each_size(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ import struct
 import lz4.block
 import pytest
 
+from flotilla.common.errors import UserError
 from images.builder import debian_kernel
-from images.builder.errors import UserError
 
 SETUP_SECTS = 3
 AT = 0x1000000

@@ -15,12 +15,13 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import boot, paths
-from images.builder.fleet import Robot
-from runtime.station.dialog import HELP, Dialog, keyboard
-from runtime.station.receiver import Receiver
-from runtime.station.services import State
-from runtime.station.top import Top
+from flotilla.common import paths
+from flotilla.fleet.model import Robot
+from flotilla.robot import ssh
+from flotilla.station.dialog import HELP, Dialog, keyboard
+from flotilla.station.receiver import Receiver
+from flotilla.station.services import State
+from flotilla.station.top import Top
 
 SECONDS = 30
 """For what takes none: the machine may be busy."""
@@ -73,7 +74,7 @@ def screen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Screen]:
         (tmp_path / name).write_text(SAYS.format(directory=tmp_path))
         (tmp_path / name).chmod(0o755)
     there = ["sh", "-c", 'PATH="$0:$PATH" exec sh -c "$1"', str(tmp_path)]
-    monkeypatch.setattr(boot, "ssh_command", lambda _: there)
+    monkeypatch.setattr(ssh, "command", lambda _: there)
     terminal, stdin = pty.openpty()
     dialog = Dialog(ROBOTS)
     top = Top(Receiver([]), STATES, dialog)

@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 from hokuyolx import HokuyoLX
 
-from tests.emulators import dsp3000, micromag3, oceanserver, urg
-from tests.emulators.dsp3000 import Dsp3000, Mode
-from tests.emulators.micromag3 import MicroMag3
-from tests.emulators.oceanserver import Battery, OceanServer
-from tests.emulators.serial_line import Device, Faults, Pty, SerialLine, UnixSocket, at_wrong_baud
-from tests.emulators.urg import Urg
+from lab.emulators import dsp3000, micromag3, oceanserver, urg
+from lab.emulators.dsp3000 import Dsp3000, Mode
+from lab.emulators.micromag3 import MicroMag3
+from lab.emulators.oceanserver import Battery, OceanServer
+from lab.emulators.serial_line import Device, Faults, Pty, SerialLine, UnixSocket, at_wrong_baud
+from lab.emulators.urg import Urg
 
 TIMEOUT = 20.0
 """Far more than anything here takes, because the machine may be busy."""
@@ -561,7 +561,7 @@ def test_urg_satisfies_a_driver_by_others() -> None:
 
 def test_program_prints_the_path_and_plugs_out(tmp_path: Path) -> None:
     link = tmp_path / "gyro"
-    arguments = [sys.executable, "-m", "tests.emulators", "dsp3000", "--link", str(link)]
+    arguments = [sys.executable, "-m", "flotilla", "emulate", "dsp3000", "--link", str(link)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout
         assert program.stdout.readline().strip() == str(link)

@@ -9,8 +9,8 @@ from itertools import islice
 
 import pytest
 
-from tests.emulators.igps import Faults, Igps, pack
-from tests.emulators.ir104 import Ir104, Switching
+from lab.emulators.igps import Faults, Igps, pack
+from lab.emulators.ir104 import Ir104, Switching
 
 NOWHERE = ("127.0.0.1", 9)
 

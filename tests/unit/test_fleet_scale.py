@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import inventory, paths
-from images.builder.errors import UserError
-from tests.lab import light, scale
-from tests.lab.timing import LabError
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
+from lab.containers import container, scale
+from lab.qemu.timing import LabError
 
-UP = {"outcome": "up to date", "mended": [], "messages": []}
+UP = {"outcome": "up to date", "repaired": [], "messages": []}
 
 
 def sample(robots: int, wall_s: float) -> scale.Sample:
@@ -37,7 +38,7 @@ def test_a_fleet_of_no_or_too_many_robots_is_refused(count: int, tmp_path: Path)
 
 def test_a_board_without_an_image_is_refused_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = inventory.load_fleet()
-    with pytest.raises(UserError, match="BOARD=pc: no such board in the inventory; take one of smartcoret3, x86_64"):
+    with pytest.raises(UserError, match=r"board pc: no robot has it, so there is no image; put one in its group"):
         scale.image_for(fleet, "pc")
     monkeypatch.setattr(scale, "image_of", lambda robot: tmp_path / robot.name)
     with pytest.raises(UserError, match="make image ROBOT=2"):
@@ -63,7 +64,7 @@ def test_the_line_is_that_of_the_samples() -> None:
 @pytest.mark.parametrize(
     ("status", "robots", "words"),
     [
-        (0, {"robot1": UP | {"outcome": "changed", "mended": ["/etc/hosts is missing"]}}, "robot1: .*/etc/hosts"),
+        (0, {"robot1": UP | {"outcome": "changed", "repaired": ["/etc/hosts is missing"]}}, "robot1: .*/etc/hosts"),
         (2, {"robot1": UP | {"outcome": "failed", "messages": ["is full"]}}, "status 2.*\nrobot1: .*is full"),
         (0, {}, "robot1: was not reached"),
         (4, {"robot1": UP}, "status 4"),
@@ -82,22 +83,24 @@ def test_robots_that_were_up_to_date_pass() -> None:
 
 def test_who_is_not_root_is_told_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    with pytest.raises(UserError, match=r"light robots need root: .*sudo"):
-        light.check()
+    with pytest.raises(UserError, match=r"robots in containers need root: .*sudo"):
+        container.check()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="asks the kernel, as root")
 def test_a_computer_that_refuses_something_is_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(light, "NEEDED", {"wheels": "echo there are none >&2; exit 1"})
-    with pytest.raises(UserError, match="light robots need wheels, which this computer refuses: there are none"):
-        light.check()
+    monkeypatch.setattr(container, "NEEDED", {"wheels": "echo there are none >&2; exit 1"})
+    with pytest.raises(
+        UserError, match="robots in containers need wheels, which this computer refuses: there are none"
+    ):
+        container.check()
 
 
 def test_robots_are_booted_in_namespaces_alone(tmp_path: Path) -> None:
     """Anywhere else their mounts would be this computer's."""
     fleet = inventory.load_fleet()
     with pytest.raises(ValueError, match="inside"):
-        light.boot(fleet, [], tmp_path / "no.img", tmp_path)
+        container.boot(fleet, [], tmp_path / "no.img", tmp_path)
 
 
 def test_a_robot_sees_its_boards_ports_and_sets_files(tmp_path: Path) -> None:
@@ -106,12 +109,12 @@ def test_a_robot_sees_its_boards_ports_and_sets_files(tmp_path: Path) -> None:
     (root / "etc/sysctl.d").mkdir(parents=True)
     (root / "etc/sysctl.d/50.conf").write_text((paths.OVERLAY / "etc/sysctl.d/50-flotilla.conf").read_text())
     (root / "etc/sysctl.d/99.conf").write_text("# kernel.sysrq = 1\n-kernel.printk=3\n")
-    files = light.own_files(root, inventory.load_fleet().boards["smartcoret3"])
+    files = container.own_files(root, inventory.load_fleet().boards["smartcoret3"])
     assert files["proc/sys/kernel/panic"] == Path("/proc/sys/kernel/panic").read_text()
     assert "proc/sys/kernel/printk" in files
     assert "proc/sys/kernel/sysrq" not in files
     assert files["proc/tty/driver/serial"].splitlines()[-1].startswith("11: uart:16550A ")
     assert (
         files["proc/sys/kernel/random/boot_id"]
-        != light.own_files(root, inventory.load_fleet().boards["x86_64"])["proc/sys/kernel/random/boot_id"]
+        != container.own_files(root, inventory.load_fleet().boards["x86_64"])["proc/sys/kernel/random/boot_id"]
     )

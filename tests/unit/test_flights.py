@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.scenarios import report
-from tests.scenarios.flight import Flight, Record
+from lab.scenarios import report
+from lab.scenarios.flight import Flight, Record
 
 PERIOD_NS = 10_000_000
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import host, paths
-from images.builder.errors import UserError
+from flotilla.common import host, paths
+from flotilla.common.errors import UserError
 
 _Usage = namedtuple("_Usage", "total used free")
 

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import boot, hwcheck, paths
-from images.builder.errors import UserError
-from images.builder.fleet import Robot
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Robot
+from flotilla.robot import hwcheck, ssh
 
 ANSWERS = {
     "processor": "processor\t: 0\nflags\t\t: fpu tsc cmov apic\n",
@@ -34,7 +35,7 @@ ttyS0: 16550A port:000003F8 irq:4"""
 def answering(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A robot that runs what it is sent, with other commands in place of the real ones."""
     monkeypatch.setattr(hwcheck, "CHECKS", {name: f"printf '{text}'" for name, text in ANSWERS.items()})
-    monkeypatch.setattr(boot, "ssh_command", lambda _: ["env"])
+    monkeypatch.setattr(ssh, "command", lambda _: ["env"])
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     (tmp_path / "sudo").symlink_to("/usr/bin/env")
     monkeypatch.setattr(paths, "BUILD", tmp_path)
@@ -65,7 +66,7 @@ def test_unmeasured_latency_is_said() -> None:
 
 
 def test_silence_is_an_error(answering: Path, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(boot, "ssh_command", lambda _: ["sh", "-c", "echo no route >&2; exit 255"])
+    monkeypatch.setattr(ssh, "command", lambda _: ["sh", "-c", "echo no route >&2; exit 255"])
     with pytest.raises(UserError, match="robot3 did not answer: no route; is it on and reachable"):
         hwcheck.check(robot, seconds=1)
     assert not (answering / "reports").exists()

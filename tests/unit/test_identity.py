@@ -12,12 +12,15 @@ from typing import Any
 import pytest
 import yaml
 
-from images.builder import identity, paths
-from images.builder.errors import UserError
-from images.builder.fleet import Fleet, Ibss, IsaResources, Robot
-from images.builder.inventory import load_fleet
-from runtime.station import telemetry
-from tests.scenarios import virtual
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import identity
+from flotilla.fleet.inventory import load_fleet
+from flotilla.fleet.model import Fleet, Ibss, IsaResources, Robot
+from flotilla.station import telemetry
+from flotilla.updates import multicast
+from images.builder import data_partition
+from lab.scenarios import virtual
 
 
 @pytest.fixture(scope="module")
@@ -183,9 +186,19 @@ def test_the_firewall_admits_the_fleet_alone(fleet: Fleet) -> None:
     assert f"{first}-{first + 249}" in rules
 
 
+def test_the_firewall_admits_files_from_stations_alone(fleet: Fleet) -> None:
+    """Seen to fail: another port in the template; a rule for the whole subnet."""
+    rules = _text(fleet, fleet.robots[3], "/etc/nftables.conf")
+    (rule,) = [line.strip() for line in rules.splitlines() if f"udp dport {multicast.PORT} " in line]
+    (station,) = fleet.stations
+    assert rule == f"ip saddr {{ {station.address} }} ip daddr {multicast.GROUP} udp dport {multicast.PORT} accept"
+    nobody = fleet.model_copy(update={"stations": []})
+    assert str(multicast.PORT) not in _text(nobody, nobody.robots[3], "/etc/nftables.conf")
+
+
 def test_parents_come_before_children(fleet: Fleet) -> None:
     seen = {PurePosixPath("/")}
-    for node in identity.nodes(fleet, fleet.robots[3]):
+    for node in data_partition.nodes(fleet, fleet.robots[3]):
         assert node.path.parent in seen, node.path
         seen.add(node.path)
 
@@ -196,7 +209,7 @@ def test_a_template_outside_etc_is_refused(fleet: Fleet, tmp_path: Path, monkeyp
     monkeypatch.setattr(paths, "OVERLAY", tmp_path)
     identity._environment.cache_clear()
     with pytest.raises(UserError, match=r"rootfs_overlay/usr/file\.j2: templates lie below etc/"):
-        identity.nodes(fleet, fleet.robots[3])
+        data_partition.nodes(fleet, fleet.robots[3])
     identity._environment.cache_clear()
 
 

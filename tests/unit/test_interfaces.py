@@ -7,9 +7,12 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
-from images.builder import build, identity, inventory, paths, provision
-from images.builder.errors import UserError
-from images.builder.fleet import Can, Fleet
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import identity, inventory
+from flotilla.fleet.model import Can, Fleet
+from flotilla.robot import provision
+from images.builder import build
 
 _FLEET = inventory.load_fleet()
 NETWORK = PurePosixPath("/etc/systemd/network")

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import re
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
-from images.builder import inventory, paths
-from images.builder.errors import UserError
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
 from images.builder.lock import read_lock
-from tests.latency import __main__ as command
-from tests.latency import (
+from lab.latency import (
     boottime,
+    command,
+    compiler,
     controls,
     gate,
     limits,
@@ -28,9 +31,10 @@ from tests.latency import (
     target,
     timerlat,
     trace,
-)  # fmt: skip
-from tests.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
-from tests.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
+)
+from lab.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
+from lab.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
+from lab.qemu.ssh import Ssh
 
 IDLE = Scenario("idle", "idle", CYCLICTEST)
 ACTIVITY = {"services_s": 1.0, "interrupts": 1000, "context_switches": 2000, "elapsed_s": 10.0}
@@ -352,10 +356,14 @@ def test_command_judges_both_kernels_and_the_control(
         file = tmp_path / "latency" / f"smartcoret3-{name}" / "results.json"
         file.parent.mkdir(parents=True)
         file.write_text(run_.model_copy(update={"board": "smartcoret3"}).text())
-    monkeypatch.setattr("sys.argv", ["latency", "compare"])
-    assert command.main() == status
-    said = capsys.readouterr()
-    whole = said.out + said.err
+    asked = argparse.Namespace(board="smartcoret3", kernel=None, plan="standard")
+    refused = ""
+    try:
+        command.compare(asked)
+    except UserError as error:
+        refused = str(error)
+    assert bool(refused) == bool(status)
+    whole = capsys.readouterr().out + refused
     assert f"under any load: at most 60 µs: {latest_us} µs (cpu)" in whole
     assert ("the negative control passes" in whole) == (control_us == 45)
 
@@ -391,6 +399,52 @@ def test_report_says_what_is_missing(tmp_path: Path) -> None:
     lean = made().model_copy(update={"kernel": "lean", "scenarios": {"idle": lacking}})
     page = report.write([made(), lean], tmp_path).read_text()
     assert "not in this kernel or board: /sys/kernel/&lt;tracing&gt;" in page
+
+
+def test_report_names_what_missed_periods() -> None:
+    robot = made(histogram={23: 46, 23563: 1}).model_copy(update={"where": "robot3, real time", "plan": "quick"})
+    line = "robot3, real time (quick): idle: wake-up: 47 of 5000 samples"
+    assert report.missed([robot]) == [line]
+    assert f"<li>{line}</li>" in report.render([robot])
+    whole = made(histogram={23: 5000}).model_copy(update={"plan": "quick"})
+    assert report.missed([whole]) == []
+    assert "samples</li>" not in report.render([whole])
+
+
+class _ShellThatMeasured:
+    """A robot's shell: takes everything, and has the results of a measurement."""
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        self.document = document
+
+    def run(self, argv: list[str], **_: Any) -> None:
+        """Done."""
+
+    def write(self, path: str, content: bytes) -> None:
+        """Written."""
+
+    def read(self, path: str) -> bytes:
+        return _sent(self.document)
+
+
+def test_a_robot_that_missed_periods_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiler, "programs", lambda _: {"serial_latency": b""})
+    fleet = inventory.load_fleet()
+    scenarios = {}
+    for scenario in run.planned("quick"):
+        planned = scenario.samples(run.SECONDS["quick"])
+        thread = {"histogram": {"23": planned}, "cycles": planned, "max": 23}
+        if scenario.name == "timerlat-everything":
+            thread = {"histogram": {"62": 46, "23563": 1}, "cycles": 47}
+        output = json.dumps({"thread": dict.fromkeys(scenario.meter.quantities, thread)})
+        scenarios[scenario.name] = {"output": output, "activity": ACTIVITY}
+    boot = {"before_kernel_us": 0, "userspace_us": 1, "first_step_us": 0, "finished_us": 3, "failed_units": []}
+    shell = _ShellThatMeasured({"release": "6.1", "version": "#1", "boot": boot, "scenarios": scenarios})
+    robot = fleet.robots[3]
+    found = target.measure(robot, fleet.boards[robot.board], cast(Ssh, shell), "quick", tmp_path)
+    late = found.scenarios["timerlat-everything"].latencies["interrupt"]
+    assert (late.samples, late.max_us) == (47, 23563)
+    assert len(report.missed([found])) == 2, "of the interrupt and of the thread"
 
 
 def test_a_robot_is_named_as_such() -> None:
@@ -522,7 +576,7 @@ def test_kernel_command_line_is_the_shipped_one() -> None:
     board = inventory.load_fleet().boards["smartcoret3"]
     shipped = card.kernel_arguments(board)
     nothing: Any = None
-    made = BoardBuild(board, nothing, nothing, nothing, Path(), Path(), Path())
+    made = BoardBuild(board, nothing, nothing, nothing, Path(), Path(), Path(), Path())
     measured = subject.Subject(made, Path())
     assert list(measured.arguments()[: len(shipped)]) == shipped
     assert "irqpoll" in measured.arguments()
@@ -545,6 +599,6 @@ def test_a_port_with_a_device_is_not_measured_on_a_robot() -> None:
 
 
 def test_nothing_in_the_measurement_knows_this_computer() -> None:
-    for path in (paths.PROJECT / "tests" / "latency").rglob("*.*"):
+    for path in (paths.PROJECT / "lab" / "latency").rglob("*.*"):
         if path.suffix in (".py", ".c", ".j2", ".json"):
             assert str(paths.PROJECT) not in path.read_text(), f"{paths.shown(path)} has an absolute path"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import paths
+from flotilla.common import paths
 
 HOSTILE = "a b;touch {file};'\"$HOME`touch {file}`$(touch {file})"
 RECORDER = """#!{python}
@@ -31,6 +31,9 @@ GIVEN = {
     "provision": ["PLAYBOOK", "ROBOT"],
     "new-app": ["KIND", "NAME"],
     "deploy": ["ROBOT", "APP", "RUN"],
+    "rotate-key": ["ROBOT"],
+    "releases": ["ROBOT"],
+    "cve": ["TRACKER"],
     "bench": ["ROBOT"],
     "record": ["PORT", "SECONDS", "ADDRESS"],
     "live": ["OUT", "SECONDS"],
@@ -53,7 +56,9 @@ def make(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
     for name in ("python", "ansible-playbook"):
         (programs / name).write_text(RECORDER.format(python=sys.executable, said=str(directory / "said")))
         (programs / name).chmod(0o755)
-    environment = {name: value for name, value in os.environ.items() if name not in ("BUILD", "KEYS", "MAKEFLAGS")}
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("BUILD", "KEYS", "APPS", "MAKEFLAGS")
+    }
     argv = ["make", "-C", str(paths.PROJECT), "-o", "setup", "-o", "setup-tests", f"BUILD={directory}", *words]
     return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60, check=False)
 
@@ -87,7 +92,7 @@ def test_what_is_given_as_words_is_no_command(tmp_path: Path, target: str) -> No
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["BUILD", "KEYS"])
+@pytest.mark.parametrize("name", ["BUILD", "KEYS", "APPS"])
 @pytest.mark.parametrize("value", ["a;id", "a b", "a`id`", "a'", 'a"'])
 def test_paths_that_a_shell_would_read_are_refused(name: str, value: str) -> None:
     argv = ["make", "-C", str(paths.PROJECT), "-n", "help", f"{name}={value}"]

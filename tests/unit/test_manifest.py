@@ -13,10 +13,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from images.builder import build, card, inventory, manifest
-from images.builder.errors import UserError
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
+from flotilla.fleet.model import Fleet
+from images.builder import build, card, manifest
 from images.builder.filesystem import Node
-from images.builder.fleet import Fleet
 from images.builder.lock import Lock, Package, Suite, format_lock, parse_lock, read_lock
 
 STATUS = """Package: libone
@@ -127,7 +128,7 @@ def test_every_build_says_in_one_line_what_its_lock_lacks(
     monkeypatch.setattr("images.builder.build.namespace.check", lambda: None)
     monkeypatch.setattr("images.builder.build.cache.exclusive", nullcontext)
     monkeypatch.setattr(build, "check_tasks", lambda *_: None)
-    monkeypatch.setattr(build, "board_build", lambda board: SimpleNamespace(lock=locks[board.name]))
+    monkeypatch.setattr(build, "board_build", lambda board, _: SimpleNamespace(lock=locks[board.name]))
     monkeypatch.setattr(build, "_robot_image", lambda *_: Path("robot.img"))
     build.build(fleet, [fleet.robots[number] for number in (1, 2, 3)])
     (line,) = capsys.readouterr().out.splitlines()
@@ -222,8 +223,8 @@ def test_no_git_no_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 EXTENTS = [
     (0, 512 + 1000),
-    (card.BOOT.start, 4096),
-    (card.BOOT.start + 8192, 4096),
+    (card.STATE.start, 4096),
+    (card.STATE.start + 8192, 4096),
     (card.SLOTS[0].start, 5),
     (card.DATA.start, 9),
 ]
@@ -243,7 +244,7 @@ def written(
     image = directory / f"robot{number}.img"
     locks = lock or read_lock("smartcoret3"), read_lock("tools")
     manifest.write(
-        fleet, fleet.robots[number], locks, common, nodes=NODES, source=source,
+        fleet, fleet.robots[number], locks, common, nodes=NODES, source=source, apps=(),
         data=manifest.Part(name="data partition", bytes=9, sha256="1"),
         image=manifest.Part(name=image.name, bytes=card.SIZE, sha256="2"), extents=EXTENTS, beside=image,
     )  # fmt: skip
@@ -259,7 +260,7 @@ def test_manifest(fleet: Fleet, tmp_path: Path) -> None:
     assert made.hostvars["address"] == str(fleet.robots[3].address)
     assert [part.name for part in made.parts] == ["vmlinuz", "data partition"]
     assert {partition.name: partition.used for partition in made.partitions} == {
-        "boot": 8192,
+        "state": 8192,
         "A": 5,
         "B": 0,
         "data": 9,

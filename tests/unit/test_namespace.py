@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import namespace
-from images.builder.errors import UserError
+from flotilla.common import namespace
+from flotilla.common.errors import UserError
 
 
 def _mounts() -> str:
@@ -31,7 +31,7 @@ def test_a_killed_builder_takes_its_stage_along(tmp_path: Path) -> None:
     """The builder is killed so that it cannot clean up; the stage's end of a pipe tells that all of it is gone."""
     read, write = os.pipe()
     code = (
-        "import subprocess, sys\nfrom images.builder import namespace\n"
+        "import subprocess, sys\nfrom flotilla.common import namespace\n"
         "stage = [*namespace.prefix(), 'sh', '-c', 'echo started; sleep 600 & wait']\n"
         "subprocess.run(stage, pass_fds=[int(sys.argv[1])])\n"
     )
@@ -56,6 +56,37 @@ def test_the_end_of_the_log_is_shown_when_a_stage_fails(tmp_path: Path) -> None:
         namespace.run_stage("images.builder.no_such_stage", [], tmp_path / "log")
 
 
+REFUSED = """
+import os
+from flotilla.common import namespace
+from flotilla.common.errors import UserError
+os.geteuid = lambda: 1000
+try:
+    namespace.check()
+except UserError as error:
+    print(error)
+print(os.waitstatus_to_exitcode(os.waitpid(-1, 0)[1]))
+"""
+"""As process 1, which inherits what unshare(1) left behind."""
+
+
+def test_a_refused_user_namespace_is_said_and_nothing_stays_behind(tmp_path: Path) -> None:
+    """In a user namespace that allows none below it. A user without a range gets no farther than that."""
+    (tmp_path / "ranges").write_text("root:100000:65536\n")
+    script = (
+        'mount --bind "$1" /etc/subuid; mount --bind "$1" /etc/subgid; echo 0 >/proc/sys/user/max_user_namespaces; '
+        'exec "$2" -c "$3"'
+    )
+    world = ["unshare", "--user", "--map-root-user", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc"]
+    done = subprocess.run(
+        [*world, "sh", "-ec", script, "sh", tmp_path / "ranges", sys.executable, REFUSED],
+        cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "/proc/sys/user/max_user_namespaces: 0: this computer forbids user namespaces" in done.stdout
+    assert done.stdout.splitlines()[-1] == f"-{signal.SIGKILL.value}"
+
+
 def test_a_forbidden_user_namespace_names_the_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     real = Path.read_text
@@ -73,11 +104,3 @@ def test_a_user_without_a_range_is_told_how_to_get_one(monkeypatch: pytest.Monke
     message = str(namespace._refusal("newuidmap: uid range [1-65536) -> [100000-165535) not allowed"))
     assert message.startswith("/etc/subuid: no range for ada")
     assert "--add-subuids" in message
-
-
-def test_watch_is_called_while_a_command_runs(tmp_path: Path) -> None:
-    """The command ends because it is watched: without a call it would wait for ever."""
-    gate = tmp_path / "gate"
-    os.mkfifo(gate)
-    namespace.run_logged("a command", ["cat", str(gate)], tmp_path / "log", watch=lambda: gate.write_text("seen"))
-    assert (tmp_path / "log").read_text() == "seen"

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import __main__ as command_line
-from images.builder import boot, inventory, param
-from images.builder.errors import UserError
-from images.builder.fleet import Robot
+from flotilla.cli import main as command_line
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
+from flotilla.fleet.model import Robot
+from flotilla.robot import parameters, ssh
 
 ROBOT = Robot(name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"))
 
@@ -19,7 +20,7 @@ ROBOT = Robot(name="robot3", number=3, board="smartcoret3", address=IPv4Address(
 @pytest.fixture
 def robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A directory of the robot's programs: ssh runs what it is sent in a shell, as there."""
-    monkeypatch.setattr(boot, "ssh_command", lambda _: ["sh", "-c", 'PATH="$0:$PATH" exec sh -c "$1"', str(tmp_path)])
+    monkeypatch.setattr(ssh, "command", lambda _: ["sh", "-c", 'PATH="$0:$PATH" exec sh -c "$1"', str(tmp_path)])
     return tmp_path
 
 
@@ -32,21 +33,21 @@ def program(directory: Path, script: str) -> None:
 def test_words_reach_the_robot_as_they_are(robot: Path) -> None:
     """Seen to fail with words that are joined by blanks: its shell takes them apart."""
     program(robot, 'for word; do echo "<$word>"; done')
-    assert param.param(ROBOT, "heading", "a.b", "two words; $HOME") == "<heading>\n<a.b>\n<two words; $HOME>"
-    assert param.param(ROBOT, "heading", "a.b", "") == "<heading>\n<a.b>\n<>"
-    assert param.param(ROBOT, "heading") == "<heading>"
+    assert parameters.param(ROBOT, "heading", "a.b", "two words; $HOME") == "<heading>\n<a.b>\n<two words; $HOME>"
+    assert parameters.param(ROBOT, "heading", "a.b", "") == "<heading>\n<a.b>\n<>"
+    assert parameters.param(ROBOT, "heading") == "<heading>"
 
 
 def test_its_reason_is_ours(robot: Path) -> None:
     program(robot, "echo 'flotilla-param: no task heading runs here' >&2; exit 1")
     with pytest.raises(UserError, match=r"^robot3: no task heading runs here$"):
-        param.param(ROBOT, "heading")
+        parameters.param(ROBOT, "heading")
 
 
 def test_no_answer_is_no_refusal(robot: Path) -> None:
     program(robot, "echo 'ssh: connect to host: No route' >&2; exit 255")
     with pytest.raises(UserError, match=r"^robot3 did not answer: ssh: connect to host: No route; is it on"):
-        param.param(ROBOT, "heading")
+        parameters.param(ROBOT, "heading")
 
 
 def test_a_value_may_be_negative(
@@ -56,6 +57,6 @@ def test_a_value_may_be_negative(
     program(robot, 'echo "$@"')
     monkeypatch.setattr(inventory, "load_fleet", lambda: None)
     monkeypatch.setattr(inventory, "robot", lambda _, number: ROBOT if number == ROBOT.number else None)
-    monkeypatch.setattr(sys, "argv", ["builder", "param", "--robot", "3", "heading", "a.b", "--", "-1e-3"])
+    monkeypatch.setattr(sys, "argv", ["flotilla", "param", "3", "heading", "a.b", "--", "-1e-3"])
     assert command_line.main() == 0
     assert capsys.readouterr().out == "heading a.b -1e-3\n"

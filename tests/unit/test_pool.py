@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import mirror, paths, pool
-from images.builder.errors import UserError
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from images.builder import mirror, pool
 from images.builder.lock import Lock, Package, Suite
 from images.builder.mirror import DEBIAN, SECURITY, Mirrors
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import bmap, card, qemu
+from images.builder import bmap, card
 from images.builder.flash import flash
+from lab.qemu import qemu
 
 
 @pytest.fixture(autouse=True)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 import yaml
 
-from images.builder import paths, provision
-from images.builder.errors import UserError
-from images.builder.identity import render
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet.identity import render
+from flotilla.robot import provision
 
 ROLES = paths.PROJECT / "ansible" / "roles"
 
@@ -42,11 +46,22 @@ def test_what_no_role_looks_after_is_an_error() -> None:
 def test_every_role_is_there_and_played() -> None:
     named = set(yaml.safe_load(provision.ROLES.read_text()))
     (play,) = yaml.safe_load((paths.PROJECT / "ansible" / "fleet.yml").read_text())
-    (mended,) = play["tasks"]
-    assert named == set(mended["loop"]) == {path.name for path in ROLES.iterdir()}
+    (repaired,) = play["tasks"]
+    assert named == set(repaired["loop"]) == {path.name for path in ROLES.iterdir()}
     assert all((ROLES / name / "meta" / "argument_specs.yml").exists() for name in named)
 
 
 def test_a_stranger_is_an_error() -> None:
     with pytest.raises(UserError, match="robot9 is not a robot of ansible/inventory"):
         provision.robot(paths.INVENTORY, "robot9")
+
+
+def test_the_playbook_rotates_keys_by_a_command_that_there_is() -> None:
+    """Seen to fail with the builder's package, which was the command line once."""
+    plays = yaml.safe_load((paths.PROJECT / "ansible" / "replace.yml").read_text())
+    (argv,) = (task["vars"]["rotate_key"] for task in plays[0]["tasks"] if "vars" in task)
+    assert argv[0] == "{{ ansible_playbook_python }}"
+    for words in (["3"], ["3", "--retire"]):
+        whole = [sys.executable, *argv[1:], *words, "--help"]
+        done = subprocess.run(whole, cwd=paths.PROJECT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr

@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 
-from images.builder import boot, paths, qemu
-from images.builder.errors import UserError
-from images.builder.fleet import Board, Network, Robot
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Board, Network, Robot
+from flotilla.robot import ssh
+from lab.qemu import boot, qemu
 
 ROBOT = Robot(name="robot3", address=IPv4Address("10.42.0.3"), number=3, board="pc104")
 NETWORK = Network(subnet=IPv4Network("10.42.0.0/24"), link="ethernet", dds_domain=0, udp_ports=[])
@@ -61,7 +63,7 @@ def qemu_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A build directory and keys of the test's own."""
-    monkeypatch.setattr(boot, "RUN", tmp_path / "run")
+    monkeypatch.setattr(ssh, "RUN", tmp_path / "run")
     monkeypatch.setattr(paths, "KEYS", tmp_path / "keys of ours")
     paths.KEYS.mkdir()
     (paths.KEYS / "operator_ed25519").touch()
@@ -211,20 +213,20 @@ def test_boot_without_image(build: Path) -> None:
 
 
 def test_port_is_known_only_while_make_boot_runs(build: Path) -> None:
-    assert boot.forwarded_port(ROBOT) is None
-    with boot.announced(ROBOT, 40022):
-        assert boot.forwarded_port(ROBOT) == 40022
-        with pytest.raises(UserError, match="runs already"), boot.announced(ROBOT, 40023):
+    assert ssh.forwarded_port(ROBOT) is None
+    with ssh.announced(ROBOT, 40022):
+        assert ssh.forwarded_port(ROBOT) == 40022
+        with pytest.raises(UserError, match="runs already"), ssh.announced(ROBOT, 40023):
             pass
-        assert boot.forwarded_port(ROBOT) == 40022
-    assert boot.forwarded_port(ROBOT) is None
+        assert ssh.forwarded_port(ROBOT) == 40022
+    assert ssh.forwarded_port(ROBOT) is None
 
 
 def ssh_command(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What `make ssh` would become."""
     became: list[str] = []
     monkeypatch.setattr(os, "execvp", lambda _, argv: became.extend(argv))
-    boot.ssh(ROBOT, ["uptime"])
+    ssh.shell(ROBOT, ["uptime"])
     return became
 
 
@@ -243,11 +245,11 @@ def test_ssh_pins_the_host_key(build: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_ssh_prefers_the_guest(build: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with boot.announced(ROBOT, 40022):
+    with ssh.announced(ROBOT, 40022):
         assert ssh_command(monkeypatch)[-4:] == ["-p", "40022", "127.0.0.1", "uptime"]
 
 
 def test_ssh_without_keys(build: Path) -> None:
     (paths.KEYS / "known_hosts").unlink()
     with pytest.raises(UserError, match="known_hosts is missing"):
-        boot.ssh(ROBOT)
+        ssh.shell(ROBOT)

@@ -14,7 +14,8 @@ import yaml
 from ansible.plugins.test.core import TestModule as CoreTests
 from ansible.plugins.test.mathstuff import TestModule as SetTests
 
-from images.builder import inventory, paths
+from flotilla.common import paths
+from flotilla.fleet import inventory
 
 ANSIBLE = paths.PROJECT / "ansible"
 UNIT = {

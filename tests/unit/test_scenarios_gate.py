@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from images.builder.errors import UserError
-from tests.latency.results import Latency
-from tests.scenarios import gate
+from flotilla.common.errors import UserError
+from lab.latency.results import Latency
+from lab.scenarios import gate
 
 FOUND = {"udp": {"first → second": Latency.of({300: 5, 410: 1}), "four hops": Latency.of({1500: 6})}}
 

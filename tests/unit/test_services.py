@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import boot
-from images.builder.errors import UserError
-from images.builder.fleet import Robot
-from runtime.station.services import State, Told, ask
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Robot
+from flotilla.robot import ssh
+from flotilla.station.services import State, TaskStatus, ask
 
 ROBOT = Robot(
     name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"), control_tasks=["valves", "sensors"]
@@ -44,7 +44,7 @@ def robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     asked = "--property=Id,ActiveState,SubState,NRestarts,ActiveEnterTimestampMonotonic"
     words = f"show {asked} flotilla-task@valves.service flotilla-task@sensors.service"
     program(tmp_path, "systemctl", f'#!/bin/sh\n[ "$*" = "{words}" ] && exec /bin/cat {tmp_path}/said\n')
-    monkeypatch.setattr(boot, "ssh_command", lambda _: [str(tmp_path / "ssh")])
+    monkeypatch.setattr(ssh, "command", lambda _: [str(tmp_path / "ssh")])
     return tmp_path
 
 
@@ -57,8 +57,11 @@ def tell(robot: Path, **overruns: int | None) -> None:
     """What tasks say of themselves; a stopped one nothing."""
     for task, count in overruns.items():
         report = {"task": task, "period_s": 0.01, "overruns": count, "sensors": {"gyro": {"flag": False, "age_s": 1.5}}}
-        (robot / task).write_text(json.dumps(report) + "\n") if count is not None else (robot / task).unlink()
-    program(robot, "flotilla-param", f'#!/bin/sh\n[ "$1" = --status=json ] && exec /bin/cat {robot}/"$2"\n')
+        beside = robot / f"{task}.new"  # whoever asks meanwhile reads a whole report
+        beside.write_text(json.dumps(report) + "\n")
+        beside.rename(robot / task) if count is not None else (robot / task).unlink()
+    if not (robot / "flotilla-param").exists():  # it may be running
+        program(robot, "flotilla-param", f'#!/bin/sh\n[ "$1" = --status=json ] && exec /bin/cat {robot}/"$2"\n')
 
 
 def say(robot: Path, *units: str) -> None:
@@ -84,20 +87,20 @@ def test_what_tasks_say_of_themselves(robot: Path) -> None:
     """Overruns are new since it was asked before. Seen to fail with those of a start anew taken for a decrease."""
     say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
 
-    def told(overruns: int, lately: int) -> Told:
-        return Told(0.01, overruns, lately, {"gyro": False})
+    def status(overruns: int, lately: int) -> TaskStatus:
+        return TaskStatus(0.01, overruns, lately, {"gyro": False})
 
     tell(robot, valves=7, sensors=0)
     with closing(ask(ROBOT)) as answers:
         first = next(answers)
-        assert (first["valves"].told, first["sensors"].told) == (told(7, 0), told(0, 0))
+        assert (first["valves"].status, first["sensors"].status) == (status(7, 0), status(0, 0))
         tell(robot, valves=9, sensors=None)
         assert any(
-            (a["valves"].told, a["sensors"].told) == (told(9, 2), None)
+            (a["valves"].status, a["sensors"].status) == (status(9, 2), None)
             for a, _ in zip(answers, range(10000), strict=False)
         )
         tell(robot, valves=3)
-        assert any(a["valves"].told == told(3, 3) for a, _ in zip(answers, range(10000), strict=False))
+        assert any(a["valves"].status == status(3, 3) for a, _ in zip(answers, range(10000), strict=False))
 
 
 def until(answers: Iterator[dict[str, State]], wanted: dict[str, State]) -> bool:

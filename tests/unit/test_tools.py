@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import paths, tools
-from images.builder.errors import UserError
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from images.builder import tools
 from images.builder.lock import Lock, Package, Suite
 
 

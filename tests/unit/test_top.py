@@ -6,17 +6,19 @@ from collections.abc import Iterable
 
 import pytest
 
-from runtime.station.receiver import Receiver
-from runtime.station.recording import Field
-from runtime.station.services import State, Told
-from runtime.station.telemetry import Stream, of_task
-from runtime.station.top import Heard, Row, Top
+from flotilla.fleet.inventory import load_fleet
+from flotilla.fleet.model import Fleet, Message, Signal
+from flotilla.station.receiver import Receiver
+from flotilla.station.recording import Field
+from flotilla.station.services import State, TaskStatus
+from flotilla.station.telemetry import Stream, streams
+from flotilla.station.top import Row, StreamStats, Top
 
 SECOND_NS = 1_000_000_000
 STREAM = Stream(
     robot="robot1",
     task="valves",
-    block="report",
+    name="report",
     address="10.42.0.1",
     port=5020,
     fields=(
@@ -25,7 +27,6 @@ STREAM = Stream(
         Field("valves", "boolean", 8, 3),
         Field("flying", "boolean", 1, 11),
     ),
-    byte_order="<",
     step_s=0.01,
     every=2,
 )
@@ -33,7 +34,7 @@ STREAM = Stream(
 
 def heard(steps: Iterable[int], bad: Iterable[int] = ()) -> Row:
     """A row right after datagrams with these steps, one each 20 ms; those in `bad` have good = 0."""
-    found = Heard(STREAM, 0)
+    found = StreamStats(STREAM, 0)
     now_ns = 0
     for step in steps:
         now_ns += 20_000_000
@@ -72,11 +73,11 @@ def test_lost_are_steps_that_did_not_come(steps: list[int], lost: int) -> None:
 
 def test_a_silent_stream_has_age_and_no_rate() -> None:
     """Its flags are the last ones. Seen to fail where the window ends with the last datagram."""
-    found = Heard(STREAM, 0)
+    found = StreamStats(STREAM, 0)
     found.take({"step": 1, "good": False, "valves": (True,) * 8, "flying": True}, SECOND_NS)
     assert found.row(2 * SECOND_NS) == row(0.5, {"good": 0, "flying": 1}, age_s=1)
     assert found.row(9 * SECOND_NS) == row(0, {"good": 0, "flying": 1}, link=0, age_s=8)
-    assert Heard(STREAM, 0).row(SECOND_NS) == row(0, {}, link=0, age_s=None)
+    assert StreamStats(STREAM, 0).row(SECOND_NS) == row(0, {}, link=0, age_s=None)
 
 
 def test_flags_are_those_of_the_window() -> None:
@@ -87,7 +88,7 @@ def test_flags_are_those_of_the_window() -> None:
 def test_the_table_says_it() -> None:
     """Seen to fail with columns exchanged."""
     now_ns = 0
-    other = Stream("robot2", "control", "report", "10.42.0.2", 5021, STREAM.fields[1:], "<", 0.01, 10)
+    other = Stream("robot2", "control", "report", "10.42.0.2", 5021, STREAM.fields[1:], 0.01, 10)
     receiver = Receiver([STREAM, other])
     top = Top(receiver, clock=lambda: now_ns)
     receiver.sinks.append(top)
@@ -108,9 +109,9 @@ def test_the_table_says_it() -> None:
 def test_tasks_are_shown_with_streams_or_without() -> None:
     """Seen to fail where tasks without streams are left out."""
     states = {
-        ("robot1", "valves"): State("running 5 s", True, Told(0.01, 7, 2, {"gyro": True, "laser": False})),
+        ("robot1", "valves"): State("running 5 s", True, TaskStatus(0.01, 7, 2, {"gyro": True, "laser": False})),
         ("robot1", "heading"): State("no answer", False),
-        ("robot1", "slow"): State("running 5 s", True, Told(0.25, 0, 0, {})),
+        ("robot1", "slow"): State("running 5 s", True, TaskStatus(0.25, 0, 0, {})),
     }
     top = Top(Receiver([STREAM]), states, clock=lambda: 0)
     assert [" ".join(line.split()) for line in top.end().splitlines()] == [
@@ -121,23 +122,21 @@ def test_tasks_are_shown_with_streams_or_without() -> None:
     ]
 
 
-def test_the_rate_is_the_task_file_s() -> None:
-    task = {
-        "period": "2.5 ms",
-        "blocks": {
-            "report": {"type": "pack", "parameters": {"types": ["double"]}},
-            "out": {
-                "type": "udp-send",
-                "every": "4",
-                "in": {"data": "report.out"},
-                "parameters": {"address": "10.42.0.254", "port": "5020"},
-            },
-        },
-    }
-    (stream,) = of_task("robot1", "10.42.0.1", "valves", task, {"10.42.0.254"})
+def reporting(rate_hz: float, every: int, charge: str | None = None, **signals: Signal) -> Fleet:
+    """The fleet, with this message from robot 1 to the stations."""
+    fleet = load_fleet()
+    message = Message(
+        sender="heading", receiver="stations", port=5030, rate_hz=rate_hz, every=every, charge=charge, signals=signals
+    )
+    return fleet.model_copy(update={"messages": {"heading-power": message}})
+
+
+def test_the_rate_is_the_message_s() -> None:
+    one = Signal(type="double", unit=["1"])
+    (stream,) = streams(reporting(100, 4, left=one))
+    assert (stream.topic, stream.length) == ("/robot1/heading/power", 8)
     assert (stream.step_s, stream.every, stream.rate_hz) == pytest.approx((0.0025, 4, 100))
-    (stream,) = of_task("robot1", "10.42.0.1", "valves", task | {"period": "500us"}, {"10.42.0.254"})
-    assert stream.rate_hz == pytest.approx(500)
+    assert not streams(reporting(100, 4, left=one).model_copy(update={"stations": []}))
 
 
 def test_the_link_is_that_of_the_last_steps() -> None:
@@ -146,26 +145,11 @@ def test_the_link_is_that_of_the_last_steps() -> None:
     assert heard([*range(2, 600, 2), *range(602, 1200, 4)]).link == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_batterys_charge_is_found_by_its_block() -> None:
-    """Whatever the stream calls it. Seen to fail where any field of a battery's is its charge."""
-    task = {
-        "period": "10 ms",
-        "blocks": {
-            "power": {"type": "oceanserver", "parameters": {"device": "/dev/robot/battery"}},
-            "report": {
-                "type": "pack",
-                "in": {"left": "power.remaining", "soc": "power.charge", "one": "1"},
-                "parameters": {"types": ["double", "double", "double"], "names": ["left", "soc", "one"]},
-            },
-            "out": {
-                "type": "udp-send",
-                "in": {"data": "report.out"},
-                "parameters": {"address": "10.42.0.254", "port": "5020"},
-            },
-        },
-    }
-    (stream,) = of_task("robot1", "10.42.0.1", "valves", task, {"10.42.0.254"})
-    found = Heard(stream, 0)
+def test_a_batterys_charge_is_the_signal_that_the_message_names() -> None:
+    """Whatever that is called. Seen to fail where any field of a battery's is its charge."""
+    one = Signal(type="double", unit=["1"])
+    (stream,) = streams(reporting(100, 1, charge="soc", left=one, soc=one, one=one))
+    found = StreamStats(stream, 0)
     assert (stream.charge, found.row(1).charge) == ("soc", None)
     found.take({"left": 60.0, "soc": 0.15, "one": 1.0}, 1)
     assert found.row(1).charge == 0.15

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import paths, verify
-from images.builder.errors import UserError
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from images.builder import verify
 
 NOW = datetime.now(UTC)
 

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Never
 
 import pytest
 
-from images.builder import paths
-from images.builder.errors import UserError
-from images.builder.fleet import Fleet, Robot
-from tests.lab import fleet as virtual
+from flotilla.common import paths, progress
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
+from flotilla.fleet.model import Fleet, Robot
+from lab.qemu import virtual_fleet as virtual
 
 SECONDS = 60
 """For what takes one or two: the machine may be busy."""
@@ -23,7 +27,7 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 
 def boots_for_ever(fleet: Fleet, robots: Sequence[Robot], directory: Path) -> Never:
-    """Guests, as `tests.lab.fleet.running`: says what lay there before them, and when they end."""
+    """Guests, as `lab.qemu.virtual_fleet.running`: says what lay there before them, and when they end."""
     print(*sorted(path.name for path in directory.iterdir()), flush=True)
     try:
         while True:
@@ -51,11 +55,34 @@ def start(tmp_path: Path) -> Iterator[Start]:
         process.communicate()
 
 
+def test_ansible_has_patience_with_guests(tmp_path: Path) -> None:
+    """Seen to fail on a busy host: `Timeout (62s) waiting for privilege escalation prompt`, and robot 1 unreachable."""
+    guests, ssh, asked = tmp_path / "guests.yml", tmp_path / "ssh", tmp_path / "asked"
+    guests.write_text(virtual.guests_inventory({"robot1": 1}))
+    ssh.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" >{asked}\n')
+    ssh.chmod(0o755)
+    program = Path(sys.executable).with_name("ansible")
+    argv: list[str | Path] = [
+        program,
+        "-i",
+        guests,
+        "guests",
+        "-m",
+        "raw",
+        "-a",
+        "true",
+        "-e",
+        f"ansible_ssh_executable={ssh}",
+    ]
+    subprocess.run(argv, cwd=paths.PROJECT / "ansible", check=True, capture_output=True)
+    assert f"ConnectTimeout={virtual.LET_IN_SECONDS}" in asked.read_text().splitlines()
+
+
 def test_a_fleet_whose_guests_boot_can_be_ended(start: Start, tmp_path: Path) -> None:
     """Seen to fail while SIGTERM was blocked, and with what a killed fleet left still there."""
 
     def run(command: str) -> str:
-        return "".join(start("tests.lab.fleet", command).communicate(timeout=SECONDS))
+        return "".join(start("flotilla", "fleet", command).communicate(timeout=SECONDS))
 
     overlay = tmp_path / "fleet" / "robot1" / "card.qcow2"
     overlay.parent.mkdir(parents=True)
@@ -83,6 +110,33 @@ def test_a_killed_fleets_number_is_nobodys(tmp_path: Path, monkeypatch: pytest.M
     with someone, pytest.raises(UserError, match="did not end within 0 s"):
         virtual.down()
     assert killed == []
+
+
+def test_a_starting_fleet_says_whom_it_waits_for(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which guest, how many have booted, how long it took. Seen to fail with the step's calls of `at` removed."""
+    pictures: list[str] = []
+    image = tmp_path / "image"
+    image.touch()
+    holder = SimpleNamespace(stdout=io.StringIO("robot1\nrobot2\n"), poll=lambda: None)
+    ports = iter([{}, {"robot1": 1, "robot2": 2}, {"robot1": 1, "robot2": 2}])
+    for name, value in {"DIRECTORY": tmp_path, "_LOG": tmp_path / "log", "guest_ports": lambda: next(ports)}.items():
+        monkeypatch.setattr(virtual, name, value)
+    monkeypatch.setattr(inventory, "load_fleet", lambda: fleet)
+    monkeypatch.setattr(virtual, "image_of", lambda _: image)
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **_more: holder)
+    monkeypatch.setattr(progress.Step, "show", lambda step: pictures.append(step._picture()))
+    monkeypatch.setattr(progress, "_SHOWN_S", 0)
+    monkeypatch.setattr(progress, "VERBOSE", False)
+    monkeypatch.setattr(progress, "_TERMINAL", False)
+    virtual.up(2)
+    shown = [re.sub(r"^\S+ boot 2 guests: |\d+:\d\d.*", "", picture) for picture in pictures]
+    assert list(dict.fromkeys(shown)) == [
+        "", "robot1, 0 % of 2 guests, ", "robot2, 50 % of 2 guests, ", "100 % of 2 guests, "
+    ]  # fmt: skip
+    lines = [re.sub(r"[\d.]+ s", "… s", line) for line in capsys.readouterr().err.splitlines()]
+    assert lines[:3] == ["boot 2 guests: robot1: … s", "boot 2 guests: robot2: … s", "boot 2 guests: … s"]
 
 
 if __name__ == "__main__":

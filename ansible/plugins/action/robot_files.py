@@ -1,4 +1,4 @@
-"""The station's half of `robot_files`: of the drift that `robot_state` found, mends what its role looks after.
+"""The station's half of `robot_files`: of the drift that `robot_state` found, repairs what its role looks after.
 
 It asks nothing of a robot where nothing drifted, so an up-to-date robot costs a single round trip in all.
 """
@@ -6,15 +6,12 @@ It asks nothing of a robot where nothing drifted, so an up-to-date robot costs a
 from __future__ import annotations
 
 import base64
-import sys
 from pathlib import Path
 from typing import Any
 
 from ansible.plugins.action import ActionBase
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[3]))  # the project
-
-from images.builder import provision
+from flotilla.apps import assigned
+from flotilla.robot import provision
 
 PRIVATE = "(private)\n"
 
@@ -22,8 +19,10 @@ PRIVATE = "(private)\n"
 class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
     """Needs `robot`, the registered result of `robot_state`.
 
-    `then`: a shell command that makes files take effect, and mends the other faults of its role.
-    Result `paths`: the files that were, or would be, mended.
+    `then`: a shell command that makes files take effect, and repairs the other faults of its role.
+    `apps`: whether the role is that of the apps. Those are put right before the files are written: an app's listing
+    comes when the app is there, and goes when the app is gone.
+    Result `paths`: the files that were, or would be, repaired.
     """
 
     _supports_check_mode = True
@@ -38,7 +37,10 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         result: dict[str, Any] = {"changed": bool(drift or faults), "paths": [found["path"] for found in drift]}
         if not result["changed"]:
             return result
-        files = provision.files(Path(task_vars["inventory_dir"]), task_vars["inventory_hostname"])
+        place = Path(task_vars["inventory_dir"]), task_vars["inventory_hostname"]
+        fleet, robot = provision.robot(*place)
+        built = assigned.built(fleet, [robot])[robot.name]
+        files = provision.files(*place, built)
         result["diff"] = [
             {
                 "before_header": f"{found['path']} {found['why']}",
@@ -60,6 +62,9 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             for path in paths["write"]
         }
         arguments = paths | {"write": written, "then": self._task.args.get("then", "true")}
+        arguments["before"] = []
+        if self._task.args.get("apps"):
+            arguments["before"] = assigned.repairs(task_vars["robot"]["app_actions"], built)
         result |= self._execute_module("robot_files", arguments, task_vars=task_vars)
         return result
 

@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 import hashlib
-import sys
 from pathlib import Path
 from typing import Any
 
 from ansible.errors import AnsibleActionFail
 
 from ansible.plugins.action import ActionBase
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[3]))  # the project
-
-from images.builder import health, provision
-from images.builder.errors import UserError
+from flotilla.apps import assigned
+from flotilla.common.errors import UserError
+from flotilla.fleet.apps import BuiltApp
+from flotilla.robot import apps, health, provision, release
 
 KEEP = [
     "/etc/mtab",  # made by systemd at boot
-    "/etc/systemd/system/flotilla-app@*",  # made by `make deploy`
-    "/etc/systemd/system/multi-user.target.wants/flotilla-app@*",  # with KEEP=1
+    "/etc/systemd/system/flotilla-app@*",  # of apps: `library/robot_state.py` looks at them as parts of those
+    "/etc/systemd/system/multi-user.target.wants/flotilla-app@*",
 ]
 """What a robot has in its layer of /etc besides, as shell patterns."""
 TASK = "flotilla-task@"
 
 
 class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
-    """Result `state`: what `library/robot_state.py` found, each drift with the `role` that mends it; `wanted`: what the
-    inventory says; `faults`: by role, what is wrong besides files; `up_to_date`: nothing is to be mended; `unhealthy`:
-    what the variable `health` does not permit of what control tasks say of themselves.
+    """Result `state`: what `library/robot_state.py` found, each drift with the `role` that repairs it.
+
+    `wanted`: what the inventory says. `release_drift`: in words, how root, kernel or runtime differ from the image's.
+    `faults`: by role, what is wrong besides files. `up_to_date`: there is no drift and no fault. `app_actions`: what
+    the role `apps` has to do. `by_hand`: words on apps that the robot has beside the inventory's. `unhealthy`: what the
+    variable `health` does not permit of what control tasks say of themselves.
     """
 
     _supports_check_mode = True
@@ -40,7 +41,8 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         place = Path(task_vars["inventory_dir"]), task_vars["inventory_hostname"]
         try:
             fleet, robot = provision.robot(*place)
-            files = provision.files(*place)
+            built = assigned.built(fleet, [robot])[robot.name]
+            files = provision.files(*place, built)
             policy = health.policy(task_vars.get("health", {}))
         except UserError as error:
             raise AnsibleActionFail(str(error)) from error
@@ -52,6 +54,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             "keep": KEEP,
             "interface": fleet.interface(robot),
             "control_tasks": robot.control_tasks,
+            "apps": {app.name: _described(app) for app in built},
             "required_sensors": policy.required_sensors,
         }
         result: dict[str, Any] = self._execute_module("robot_state", arguments, task_vars=task_vars)
@@ -69,18 +72,45 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             }
             for found in state["drift"]:
                 found["role"] = provision.role_of(found["path"])
-            faults = _faults(state, wanted)
+            judged = apps.judge(robot.number, state["apps"], built)
+            faults = _faults(state, wanted) | {"apps": judged.faults}
+            if judged.notes:
+                result["warnings"] = [f"{robot.name}: {note}" for note in judged.notes]
             result |= {
                 "wanted": wanted,
                 "faults": faults,
+                "app_actions": judged.actions,
+                "by_hand": judged.notes,
                 "up_to_date": not state["drift"] and not any(faults.values()),
                 "unhealthy": health.complaints(state["tasks"], policy),
+                "release_drift": _release_drift(state["release"], release.wanted(robot)),
             }
         return result
 
 
+def _release_drift(found: dict[str, Any] | None, wanted: str | None) -> str:
+    """In words, how the release that runs differs from that of the robot's image here; empty where it does not."""
+    if not found or not found["running"] or not wanted:  # in a container, or without an image
+        return ""
+    runs = found["slots"][found["running"]]
+    if runs["blob"] == wanted:
+        return ""
+    return (
+        f"runs release {runs['release']} with kernel {runs['kernel']} and content {runs['blob'][:16]}, its image here "
+        f"is {wanted[:16]}: make bundle, make update"
+    )
+
+
+def _described(app: BuiltApp) -> dict[str, Any]:
+    """An app as the robot should have it."""
+    return {
+        "version": app.version,
+        "files": {path: {"sha256": sha256, "mode": mode} for path, (sha256, mode) in app.hashes.items()},
+    }
+
+
 def _faults(state: dict[str, Any], wanted: dict[str, Any]) -> dict[str, list[str]]:
-    """What is wrong besides files, in words, by the role that mends it."""
+    """What is wrong besides files, in words, by the role that repairs it."""
     name, addresses = state["hostname"], state["addresses"]
     down = {is_task: [unit for unit in state["down"] if unit.startswith(TASK) == is_task] for is_task in (True, False)}
     return {

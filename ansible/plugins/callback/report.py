@@ -1,25 +1,21 @@
 """What a run did to the fleet, as `build/reports/fleet.json` for programs and `fleet.html` for people.
 
-`robots`: by name, `outcome` (`up to date`, `changed`, `would change`, `failed`, `unreachable`), `mended` (what was, or
-would be, put right), `messages` (why it failed), `state` and `unhealthy` (what `robot_state` last found). Robots that a
-stopped roll-out did not come to are not there.
+`robots`: by name, `outcome` (`up to date`, `changed`, `would change`, `failed`, `unreachable`), `repaired` (what
+was, or would be, put right), `messages` (why it failed), `state`, `unhealthy` and `by_hand` (what
+`robot_state` last found). Robots that a roll-out did not come to are not there.
 """
 
 from __future__ import annotations
 
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from ansible.plugins.callback import CallbackBase
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[3]))  # the project
-
 import jinja2
 
-from images.builder import paths
+from ansible.plugins.callback import CallbackBase
+from flotilla.common import paths
 
 DOCUMENTATION = """
 name: report
@@ -52,11 +48,11 @@ class CallbackModule(CallbackBase):  # type: ignore[misc]  # Ansible has no type
         found = result._result
         robot = self._robot(result)
         if "state" in found and "faults" in found:
-            robot |= {key: found[key] for key in ("state", "unhealthy")}
+            robot |= {key: found[key] for key in ("state", "unhealthy", "by_hand")}
         if found.get("changed"):
             differences = found.get("diff") or []
             listed = [each for each in differences if isinstance(each, dict)] if isinstance(differences, list) else []
-            robot["mended"] += [_difference(each) for each in listed] or [result._task.get_name()]
+            robot["repaired"] += [_difference(each) for each in listed] or [result._task.get_name()]
 
     def v2_runner_on_failed(self, result: Any, ignore_errors: bool = False) -> None:
         robot = self._robot(result)
@@ -92,7 +88,14 @@ class CallbackModule(CallbackBase):  # type: ignore[misc]  # Ansible has no type
         self._display.display(f"{paths.shown(directory / self._playbook)}.html")
 
     def _robot(self, result: Any) -> dict[str, Any]:
-        empty: dict[str, Any] = {"outcome": "", "mended": [], "messages": [], "state": None, "unhealthy": []}
+        empty: dict[str, Any] = {
+            "outcome": "",
+            "repaired": [],
+            "messages": [],
+            "state": None,
+            "unhealthy": [],
+            "by_hand": [],
+        }
         return self._robots.setdefault(result._host.get_name(), empty)
 
 

@@ -1,5 +1,5 @@
-/* A triple buffer: frames pass from one thread to another, of which only the newest matters. Neither ever waits; each
- * owns one of three buffers, and exchanges it for the third. */
+/* A triple buffer hands frames from one thread to another, where only the newest matters. Neither thread waits: each
+ * owns one of three buffers and swaps it for the third. */
 #ifndef FLOTILLA_CAMERA_FRAMES_H
 #define FLOTILLA_CAMERA_FRAMES_H
 
@@ -22,7 +22,7 @@ struct frames {
 /* Buffers of `bytes` each, in memory of the block. FL_OK, or FL_FAILED after fl_fail(). */
 int frames_allocate(struct fl_block *block, struct frames *frames, size_t bytes);
 
-/* The producer's buffer; to be filled, and then handed over by frames_publish. */
+/* The producer's buffer, to be filled and then handed over by frames_publish. */
 uint8_t *frames_back(struct frames *frames);
 void frames_publish(struct frames *frames, int64_t at_ns);
 

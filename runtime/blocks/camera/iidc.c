@@ -1,7 +1,15 @@
-/* The block `frame-grabber-iidc`: a FireWire camera by libdc1394, over the kernel's firewire-ohci. A plug-in, so that
- * robots without such a camera need no libdc1394. */
+/** frame-grabber-iidc
+ *
+ * Grabs images of a FireWire camera by libdc1394, over the kernel's firewire-ohci, in shades of grey. A thread takes
+ * them from the library; the step copies the newest. The block is a plug-in, so that robots without such a camera need
+ * no libdc1394.
+ *
+ * Failure: The flag is 0 once no image came for `timeout`, and while the camera is not there. While the flag is 0 the
+ * values stay the last good ones, and `age` grows. An image that is damaged is dropped. A camera that is missing, or
+ * silent for 1 s, is opened again every second; the journal says once what is wrong.
+ */
 #define _GNU_SOURCE
-#include "drivers/wall_clock.h"
+#include "core/wall_clock.h"
 #include "grabber.h"
 
 #include <dc1394/dc1394.h>
@@ -23,13 +31,13 @@ struct iidc {
 #define RATES "1.875|3.75|7.5|15|30|60"
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct iidc, guid, .fallback = "",
+    FL_PARAMETER(struct iidc, guid, .default_value = "",
                  .summary =
                      "the camera's number, 16 hexadecimal digits as on its label; empty: the first that is found"),
     GRABBER_PARAMETERS(struct iidc),
-    FL_PARAMETER(struct iidc, rate, .fallback = "15", .choices = RATES, .unit = "1/s",
+    FL_PARAMETER(struct iidc, rate, .default_value = "15", .choices = RATES, .unit = "1/s",
                  .summary = "images to take; sizes that are no standard mode are taken as fast as the bus allows"),
-    FL_PARAMETER(struct iidc, shutter, .fallback = "0", .min = 0, .max = 10, .unit = "s",
+    FL_PARAMETER(struct iidc, shutter, .default_value = "0", .min = 0, .max = 10, .unit = "s",
                  .summary = "time of exposure; 0 leaves it to the camera"),
 };
 
@@ -79,7 +87,7 @@ static bool set_size(dc1394camera_t *camera, const struct iidc *set)
                                   0, 0, (int32_t)set->width, (int32_t)set->height) == DC1394_SUCCESS;
 }
 
-/* What a camera does not offer it keeps as it is. */
+/* A setting that the camera does not offer is left as it is. */
 static void set_shutter(dc1394camera_t *camera, double seconds)
 {
     if (seconds <= 0)
@@ -101,14 +109,14 @@ static void close_session(struct session *session)
     *session = (struct session){0};
 }
 
-/* The library looks for the bus when it is begun, so it is begun anew each time. */
+/* The library looks for the bus only when it is opened, so open it again each time. */
 static bool open_session(struct session *session, struct grabber *grabber)
 {
     const struct iidc *set = grabber->parameters;
     session->library = dc1394_new();
     session->camera = session->library ? find(session->library, set->guid) : NULL;
     if (!session->camera) {
-        GRABBER_TELL(grabber, "no camera %s%son the FireWire bus; trying on", set->guid, *set->guid ? " " : "");
+        GRABBER_TELL(grabber, "no camera %s%son the FireWire bus; retrying", set->guid, *set->guid ? " " : "");
     } else if (dc1394_video_set_iso_speed(session->camera, DC1394_ISO_SPEED_400) != DC1394_SUCCESS ||
                !set_size(session->camera, set)) {
         GRABBER_TELL(grabber,
@@ -175,9 +183,9 @@ static void run(struct fl_driver *driver, void *context)
             ;
         atomic_store(&grabber->connected, false);
         if (ready == 0)
-            GRABBER_TELL(grabber, "no image for %d ms; beginning anew", SILENCE_MS);
+            GRABBER_TELL(grabber, "no image for %d ms; restarting it", SILENCE_MS);
         else if (ready != -1)
-            GRABBER_TELL(grabber, "the camera is gone; trying on");
+            GRABBER_TELL(grabber, "the camera is gone; retrying");
         close_session(&session);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);
 }

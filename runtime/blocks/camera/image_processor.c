@@ -1,4 +1,17 @@
-/* The block `image-processor`: where the bright spots of an image are. */
+/** image-processor
+ *
+ * Finds up to three bright spots in an image that is otherwise black, and where they are.
+ *
+ * Equations:
+ *   a spot: pixels brighter than `threshold` that touch by side or corner, `min_pixels` to `max_pixels` of them
+ *   brightness = Σ (pixel − threshold)
+ *   column, row = Σ (pixel − threshold)·(its column, row)/brightness
+ *   x = (2·column + 1)/width − 1,  y = (2·row + 1)/height − 1
+ *
+ * Failure: The flag is 1 only in a step that saw a new and good image with a spot in it. Without a new image all
+ * values stay. A new image without a spot, or with more than 1024 regions, gives `count` 0 and zeros; `age` then goes
+ * on growing.
+ */
 #include "spots.h"
 
 #include <flotilla/block.h>
@@ -16,15 +29,15 @@ struct state {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct image_processor, width, .fallback = "640", .min = 1, .max = SPOTS_SIDE, .unit = "pixel",
+    FL_PARAMETER(struct image_processor, width, .default_value = "640", .min = 1, .max = SPOTS_SIDE, .unit = "pixel",
                  .summary = "of the image"),
-    FL_PARAMETER(struct image_processor, height, .fallback = "480", .min = 1, .max = SPOTS_SIDE, .unit = "pixel",
+    FL_PARAMETER(struct image_processor, height, .default_value = "480", .min = 1, .max = SPOTS_SIDE, .unit = "pixel",
                  .summary = "of the image"),
-    FL_PARAMETER(struct image_processor, threshold, .flags = FL_TUNABLE, .fallback = "100", .min = 0, .max = 254,
+    FL_PARAMETER(struct image_processor, threshold, .flags = FL_TUNABLE, .default_value = "100", .min = 0, .max = 254,
                  .summary = "a spot's pixels are brighter than this; below 128 it takes the least time"),
-    FL_PARAMETER(struct image_processor, min_pixels, .flags = FL_TUNABLE, .fallback = "3", .min = 1, .max = 4194304,
-                 .unit = "pixel", .summary = "smaller regions are noise"),
-    FL_PARAMETER(struct image_processor, max_pixels, .flags = FL_TUNABLE, .fallback = "4194304", .min = 1,
+    FL_PARAMETER(struct image_processor, min_pixels, .flags = FL_TUNABLE, .default_value = "3", .min = 1,
+                 .max = 4194304, .unit = "pixel", .summary = "smaller regions are noise"),
+    FL_PARAMETER(struct image_processor, max_pixels, .flags = FL_TUNABLE, .default_value = "4194304", .min = 1,
                  .max = 4194304, .unit = "pixel", .summary = "larger regions are no spots"),
 };
 
@@ -36,7 +49,10 @@ static const struct fl_port outputs[] = {
      .type = FL_DOUBLE,
      .width = SPOTS,
      .summary = "of their centres, the brightest first: -1 at the left edge of the image, 1 at the right"},
-    {.name = "y", .type = FL_DOUBLE, .width = SPOTS, .summary = "likewise: -1 at the upper edge, 1 at the lower"},
+    {.name = "y",
+     .type = FL_DOUBLE,
+     .width = SPOTS,
+     .summary = "of their centres: -1 at the upper edge, 1 at the lower"},
     {.name = "brightness",
      .type = FL_DOUBLE,
      .width = SPOTS,
@@ -55,7 +71,7 @@ static int configure(struct fl_block *block)
          .width = (uint32_t)(set->width * set->height),
          .summary = "brightness of its pixels, row by row from the top left"},
         {.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: the image is good"},
-        {.name = "sequence", .type = FL_UINT32, .width = 1, .summary = "another number with each new image"},
+        {.name = "sequence", .type = FL_UINT32, .width = 1, .summary = "changes with each new image"},
         {.name = "age",
          .type = FL_DOUBLE,
          .width = 1,

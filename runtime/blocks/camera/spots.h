@@ -34,7 +34,7 @@ struct spots_run {
     uint16_t region;
 };
 struct spots_region {
-    uint16_t parent; /* itself, unless it was joined to one of a lower number */
+    uint16_t parent; /* itself, or the region of a lower number that it was joined to */
     uint32_t pixels;
     uint64_t weight, column_moment, row_moment;
 };

@@ -1,4 +1,12 @@
-/* The block `frame-grabber-v4l2`: a camera of Linux's Video4Linux2, streaming into buffers mapped from the driver. */
+/** frame-grabber-v4l2
+ *
+ * Grabs images of a camera of Linux's Video4Linux2, in shades of grey. A thread takes them from buffers that the
+ * driver fills; the step copies the newest.
+ *
+ * Failure: The flag is 0 once no image came for `timeout`, and while the camera is not there. While the flag is 0 the
+ * values stay the last good ones, and `age` grows. An image that is damaged is dropped. A camera that is missing, or
+ * silent for 1 s, is opened again every 0.5 s; the journal says once what is wrong.
+ */
 #define _GNU_SOURCE
 #include "grabber.h"
 
@@ -22,16 +30,16 @@ struct v4l2 {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct v4l2, device, .fallback = "/dev/video0", .summary = "the camera"),
+    FL_PARAMETER(struct v4l2, device, .default_value = "/dev/video0", .summary = "the camera"),
     GRABBER_PARAMETERS(struct v4l2),
-    FL_PARAMETER(struct v4l2, rate, .fallback = "0", .min = 0, .max = 1000, .unit = "1/s",
+    FL_PARAMETER(struct v4l2, rate, .default_value = "0", .min = 0, .max = 1000, .unit = "1/s",
                  .summary = "images to take; 0 leaves it to the camera"),
-    FL_PARAMETER(struct v4l2, exposure, .fallback = "0", .min = 0, .max = 10, .unit = "s",
+    FL_PARAMETER(struct v4l2, exposure, .default_value = "0", .min = 0, .max = 10, .unit = "s",
                  .summary = "time of exposure; 0 leaves it to the camera"),
 };
 
-/* Formats that have the brightness as it is, in eight bits, best first: all of it is in the first plane, a byte every
- * `pitch`. Compressed ones (MJPG, H264) would need a library. */
+/* Formats with the brightness in bytes of their own, best first: it is in the first plane, a byte every `pitch`.
+ * Compressed formats (MJPG, H264) would need a library. */
 static const struct format {
     uint32_t code;
     uint8_t pitch, first;
@@ -70,7 +78,7 @@ static bool choose_format(struct stream *stream, const struct format *format, st
                                              .height = (uint32_t)stream->height,
                                              .pixelformat = format->code,
                                              .field = V4L2_FIELD_NONE};
-    /* A driver answers with what it will do, which need not be what it was asked for. */
+    /* A driver returns what it will do, which may differ from the request. */
     if (!request(stream->fd, VIDIOC_S_FMT, &asked) || asked.fmt.pix.pixelformat != format->code)
         return false;
     *given = asked.fmt.pix;
@@ -92,7 +100,7 @@ static void append(struct codes *codes, uint32_t code)
              (char)(code >> 8 & 0x7F), (char)(code >> 16 & 0x7F), (char)(code >> 24 & 0x7F));
 }
 
-static void tell_formats(struct grabber *grabber, const struct stream *stream, const char *path)
+static void log_formats(struct grabber *grabber, const struct stream *stream, const char *path)
 {
     struct codes usable = {""}, offered = {""};
     struct v4l2_fmtdesc described = {.type = V4L2_BUF_TYPE_VIDEO_CAPTURE};
@@ -104,8 +112,7 @@ static void tell_formats(struct grabber *grabber, const struct stream *stream, c
                  *offered.text ? offered.text : "no format", usable.text);
 }
 
-/* The first of the formats that the camera has in the size that is wanted; false after it was told that there is none.
- */
+/* Choose the first format that the camera has in the wanted size; false after logging that there is none. */
 static bool choose(struct grabber *grabber, struct stream *stream, const char *path)
 {
     struct v4l2_pix_format given = {0};
@@ -116,7 +123,7 @@ static bool choose(struct grabber *grabber, struct stream *stream, const char *p
         GRABBER_TELL(grabber, "%s has images of %u x %u pixels, not of %zu x %zu: set width and height", path,
                      given.width, given.height, stream->width, stream->height);
     else
-        tell_formats(grabber, stream, path);
+        log_formats(grabber, stream, path);
     return false;
 }
 
@@ -130,7 +137,7 @@ static bool is_camera(int fd)
     return here & V4L2_CAP_VIDEO_CAPTURE && here & V4L2_CAP_STREAMING;
 }
 
-/* What a camera does not offer it keeps as it is: a wish, other than the size. */
+/* A setting that the camera does not offer is left as it is; only the size is required. */
 static void set_controls(const struct stream *stream, const struct v4l2 *set)
 {
     if (set->rate > 0) {
@@ -188,16 +195,16 @@ static bool open_stream(struct stream *stream, struct grabber *grabber)
     *stream = (struct stream){
         .fd = open(path, O_RDWR | O_NONBLOCK | O_CLOEXEC), .width = (size_t)set->width, .height = (size_t)set->height};
     if (stream->fd < 0) {
-        GRABBER_TELL(grabber, "cannot open %s: %s; trying on", path, strerror(errno));
+        GRABBER_TELL(grabber, "cannot open %s: %s; retrying", path, strerror(errno));
         return false;
     }
     if (!is_camera(stream->fd)) {
-        GRABBER_TELL(grabber, "%s is no camera: set device to one of /dev/v4l/by-id that ends with index0", path);
+        GRABBER_TELL(grabber, "%s is not a camera: set device to one of /dev/v4l/by-id that ends with index0", path);
     } else if (choose(grabber, stream, path)) {
         set_controls(stream, set);
         if (map_buffers(stream) && request(stream->fd, VIDIOC_STREAMON, &type))
             return true;
-        GRABBER_TELL(grabber, "%s does not start: %s; trying on", path, strerror(errno));
+        GRABBER_TELL(grabber, "%s does not start: %s; retrying", path, strerror(errno));
     }
     close_stream(stream);
     return false;
@@ -265,11 +272,11 @@ static void run(struct fl_driver *driver, void *context)
         while ((ready = fl_driver_wait(driver, stream.fd, false, SILENCE_MS)) == 1 && take(&stream, grabber))
             ;
         atomic_store(&grabber->connected, false);
-        /* A camera that is silent for long is begun anew: some hang after a bus reset. */
+        /* Some cameras hang after a bus reset, so a silent camera is opened again. */
         if (ready == 0)
-            GRABBER_TELL(grabber, "%s: no image for %d ms; beginning anew", set->device.path, SILENCE_MS);
+            GRABBER_TELL(grabber, "%s: no image for %d ms; restarting it", set->device.path, SILENCE_MS);
         else if (ready != -1)
-            GRABBER_TELL(grabber, "%s is gone; trying on", set->device.path);
+            GRABBER_TELL(grabber, "%s is gone; retrying", set->device.path);
         close_stream(&stream);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);
 }

@@ -1,3 +1,12 @@
+/** can-receive
+ *
+ * Receives the newest data frame of an identifier, or of several by `mask`, on a CAN bus. Frames are stamped by the
+ * kernel. A step takes 256 frames at most.
+ *
+ * Failure: The flag is 0 once no frame came for `timeout`, and while the interface is missing or down, or the
+ * controller has left the bus. While the flag is 0 the values stay the last good ones, and `age` grows. The block
+ * waits for its interface as long as it runs; the journal says once what is wrong.
+ */
 #include "socket.h"
 
 #include <flotilla/sensor.h>
@@ -16,11 +25,12 @@ struct received {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct can_receive, interface, .fallback = "can0", .summary = "network interface of the bus"),
+    FL_PARAMETER(struct can_receive, interface, .default_value = "can0", .summary = "network interface of the bus"),
     FL_PARAMETER(struct can_receive, id, .min = 0, .max = CAN_EFF_MASK, .summary = "identifier to receive"),
-    FL_PARAMETER(struct can_receive, mask, .fallback = "0x1FFFFFFF", .min = 0, .max = CAN_EFF_MASK,
+    FL_PARAMETER(struct can_receive, mask, .default_value = "0x1FFFFFFF", .min = 0, .max = CAN_EFF_MASK,
                  .summary = "bits of the identifier that must be as in `id`"),
-    FL_PARAMETER(struct can_receive, extended, .fallback = "false", .summary = "identifiers of 29 bits instead of 11"),
+    FL_PARAMETER(struct can_receive, extended, .default_value = "false",
+                 .summary = "identifiers of 29 bits instead of 11"),
     FL_SENSOR_TIMEOUT(struct can_receive, "1"),
 };
 

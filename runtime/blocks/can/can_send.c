@@ -1,3 +1,12 @@
+/** can-send
+ *
+ * Sends a data frame on a CAN bus in each step.
+ *
+ * Failure: While `age` is beyond `timeout` the frame carries `reset` instead of the data; without `reset` nothing is
+ * sent. The `reset` frame is also sent when the task ends, in whatever way, as long as the process can act. The flag
+ * is 0 while the queue is full, the interface is missing or down, or the controller has left the bus; a frame that was
+ * refused is not kept. The block waits for its interface as long as it runs.
+ */
 #include "socket.h"
 
 #include <ctype.h>
@@ -19,19 +28,19 @@ struct sent {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct can_send, interface, .flags = FL_EXCLUSIVE, .fallback = "can0",
+    FL_PARAMETER(struct can_send, interface, .flags = FL_EXCLUSIVE, .default_value = "can0",
                  .summary = "network interface of the bus"),
     FL_PARAMETER(struct can_send, id, .flags = FL_EXCLUSIVE, .min = 0, .max = CAN_EFF_MASK,
                  .summary = "identifier of the frames"),
-    FL_PARAMETER(struct can_send, length, .fallback = "8", .min = 0, .max = CAN_MAX_DLEN, .unit = "B",
+    FL_PARAMETER(struct can_send, length, .default_value = "8", .min = 0, .max = CAN_MAX_DLEN, .unit = "B",
                  .summary = "bytes of a frame"),
-    FL_PARAMETER(struct can_send, extended, .flags = FL_EXCLUSIVE, .fallback = "false",
+    FL_PARAMETER(struct can_send, extended, .flags = FL_EXCLUSIVE, .default_value = "false",
                  .summary = "an identifier of 29 bits instead of 11"),
-    FL_PARAMETER(struct can_send, reset, .fallback = "",
+    FL_PARAMETER(struct can_send, reset, .default_value = "",
                  .summary = "data of the frame sent instead when the data are too old, and at the end, as hexadecimal "
                             "digits; empty: none is sent"),
-    FL_PARAMETER(struct can_send, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "0.5", .min = 1e-6, .max = 1e6,
-                 .unit = "s", .summary = "age from which the data are too old"),
+    FL_PARAMETER(struct can_send, timeout, .flags = FL_ACTUATOR_TIMEOUT, .default_value = "0.5", .min = 1e-6,
+                 .max = 1e6, .unit = "s", .summary = "age from which the data are too old"),
 };
 
 enum { DATA, AGE };

@@ -135,8 +135,8 @@ static void list_writes(struct epos2 *drive)
     write_object(drive, 0x6040, 0, 2, DISABLE_VOLTAGE);
     write_object(drive, 0x6060, 0, 1, (uint8_t)modes[set->mode].mode);
     map_pdo(drive, 0x1400, RPDO_OFF + COB_RPDO1 + set->node, COB_RPDO1 + set->node, AT_ONCE, command, 1);
-    /* What is not used is off: the drive may have stored an identifier for it that another node uses. TPDO1 would only
-     * repeat the status word of the others, and overtake them on the bus. */
+    /* Switch unused PDOs off: the drive may have stored an identifier that another node uses. TPDO1 would only repeat
+     * the status word of the others, and overtake them on the bus. */
     write_object(drive, 0x1401, 1, 4, RPDO_OFF + COB_RPDO2 + set->node);
     write_object(drive, 0x1402, 1, 4, RPDO_OFF + COB_RPDO3 + set->node);
     write_object(drive, 0x1800, 1, 4, PDO_OFF + COB_TPDO1 + set->node);
@@ -176,7 +176,7 @@ static void enter(struct epos2 *drive, enum epos2_phase phase, int64_t now_ns)
     drive->setpoint_state = SETPOINT_NONE;
     drive->mode_display = 0;
     drive->control_word = DISABLE_VOLTAGE;
-    drive->status_before = 0x0008; /* one that is found in fault was not seen to fail */
+    drive->status_before = 0x0008; /* a drive that is already in fault did not fail while we had it */
     if (phase == EPOS2_CONFIGURING)
         list_writes(drive);
 }
@@ -294,7 +294,7 @@ static void take_motion(struct epos2 *drive, const uint8_t *data, int64_t at_ns)
 
 static void take_heartbeat(struct epos2 *drive, uint8_t state, int64_t at_ns)
 {
-    drive->heard_ns = at_ns;
+    drive->received_ns = at_ns;
     if (state == STATE_BOOT_UP) { /* as asked, or its power came back */
         enter(drive, EPOS2_CONFIGURING, at_ns);
     } else if (drive->phase == EPOS2_RUNNING && state != STATE_OPERATIONAL) {
@@ -421,7 +421,7 @@ static bool is_fault(enum axis axis)
     return axis == FAULT || axis == FAULT_REACTION;
 }
 
-/* It has a fault now, or left operation while it was told to stay there. */
+/* It has a fault now, or left operation while it was commanded to stay there. */
 static bool has_failed(const struct epos2 *drive)
 {
     enum axis before = axis_of(drive->status_before), axis = axis_of(drive->status_word);
@@ -554,15 +554,16 @@ size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_com
     size_t count = 0;
     if (drive->phase == EPOS2_CONFIGURING && drive->write_next == drive->write_count) {
         enter(drive, EPOS2_RUNNING, now_ns);
-        drive->heard_ns = now_ns;
-        /* It misses ours only after it has heard one (CiA 301, object 1016), so that comes before it may move. */
+        drive->received_ns = now_ns;
+        /* The drive monitors our heartbeat only after it has received one (CiA 301, object 1016), so send it before the
+         * motor may move. */
         drive->heartbeat_ns = INT64_MIN / 2;
         drive->contacted = true;
         drive->abort_code = 0;
         if (drive->trouble.cause != EPOS2_EMERGENCY)
             drive->trouble.cause = EPOS2_FINE;
     }
-    if (drive->phase == EPOS2_RUNNING && now_ns - drive->heard_ns > silence_ns) {
+    if (drive->phase == EPOS2_RUNNING && now_ns - drive->received_ns > silence_ns) {
         blame(drive, EPOS2_NO_HEARTBEAT);
         enter(drive, EPOS2_BOOTING, now_ns - boot_retry_ns);
     }
@@ -595,7 +596,7 @@ size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAME
     return 3;
 }
 
-size_t epos2_farewell(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])
+size_t epos2_shutdown(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])
 {
     size_t count = epos2_disable(drive, out);
     out[count++] = nmt(drive, NMT_RESET_COMMUNICATION);

@@ -1,18 +1,19 @@
-/* A Maxon EPOS2 drive as a CANopen master sees it: frames in, frames out, the time given. No I/O, so that it can be
- * tested and fuzzed with any frames.
+/* A Maxon EPOS2 drive as seen by a CANopen master: takes and returns frames, and is given the time. It does no I/O, so
+ * it can be tested and fuzzed with any frames.
  *
- * It brings the drive from any state into operation and keeps it there: reset of its communication, configuration by
- * SDO with every answer checked, NMT start, then the state machine of CiA 402, one acknowledged transition after the
- * other. Of what the drive has stored, no identifier and no mapping is relied upon: all of its PDOs are written.
- * Values are sampled by SYNC. Both sides send heartbeats: a drive that is silent is taken for gone and begun anew, and
- * a drive that misses ours stops its motor by itself. Ours are sent by epos2_advance only: whatever stops the control
- * task stops the motor.
+ * It brings the drive from any state into operation and keeps it there: reset of communication, configuration by SDO
+ * with every answer checked, NMT start, then the state machine of CiA 402, one acknowledged transition after the other.
+ * It relies on no identifier and no mapping that the drive has stored: it writes all of its PDOs. Values are sampled by
+ * SYNC. Both sides send heartbeats. A drive that falls silent is taken for lost and set up again, and a drive that
+ * misses our heartbeats stops its motor by itself. Only epos2_advance sends ours, so whatever stops the control task
+ * stops the motor.
  *
- * The motor is switched on by `enable` going from 0 to 1. Once the drive had a fault, was lost, or left operation by
- * itself, it takes another such edge, given while the drive is there. Only before the first contact an edge waits for
- * the drive.
+ * The motor is switched on when `enable` goes from 0 to 1. After a fault, after the drive was lost, or after it left
+ * operation by itself, this takes another such edge while the drive is there. Only before the first contact does an
+ * edge wait for the drive.
  *
- * Sources: CiA 301 4.2, CiA 402-2; Maxon, EPOS2 Firmware Specification, and the drive's EDS for what is shipped. */
+ * Sources: CiA 301 4.2, CiA 402-2; Maxon, EPOS2 Firmware Specification, and the EDS of the drive for its defaults.
+ */
 #ifndef FLOTILLA_EPOS2_H
 #define FLOTILLA_EPOS2_H
 
@@ -35,13 +36,13 @@ struct epos2_settings {
     uint32_t stop_rpm_per_s; /* deceleration of a quick stop */
     uint16_t limit_ma;       /* output current */
     bool automatic_reset;    /* of faults, once a second; otherwise only by switching `enable` on again */
-    bool automatic_restart;  /* of the motor, as soon as the drive is able to; otherwise only by `enable`, likewise */
+    bool automatic_restart;  /* restart of the motor, as soon as the drive can; otherwise only by `enable`, too */
 };
 
 struct epos2_command {
     bool enable;
     bool sync;     /* end with a SYNC: for all drives on the bus, so one of them in each period */
-    double target; /* rad, rad/s or A, by mode; one that is not finite is no command: the motor is stopped */
+    double target; /* rad, rad/s or A, by mode; a value that is not finite is no command, and stops the motor */
 };
 
 struct epos2_values {
@@ -52,7 +53,7 @@ enum epos2_phase {
     EPOS2_BOOTING,     /* a reset of its communication was sent; waiting for its boot-up message */
     EPOS2_CONFIGURING, /* by SDO, one at a time */
     EPOS2_RUNNING,
-    EPOS2_REFUSED, /* it aborted a configuration; begun anew after a second */
+    EPOS2_REFUSED, /* it aborted the configuration; tried again after a second */
 };
 
 /* Why the drive does not work: the first cause, until it works again. */
@@ -88,9 +89,9 @@ struct epos2 {
     size_t write_count, write_next;
     enum epos2_phase phase;
     bool sdo_waiting, reset_sent;
-    int64_t phase_ns, sdo_ns;       /* begin of the phase, of the SDO that waits */
-    int64_t heard_ns, heartbeat_ns; /* its last heartbeat, ours */
-    int64_t stop_ns, reset_ns;      /* begin of a quick stop, the last fault reset */
+    int64_t phase_ns, sdo_ns;          /* begin of the phase, of the SDO that waits */
+    int64_t received_ns, heartbeat_ns; /* its last heartbeat, ours */
+    int64_t stop_ns, reset_ns;         /* begin of a quick stop, the last fault reset */
     bool stopping, reset_wanted, was_enabled;
     bool contacted; /* it has been in operation */
     bool armed;     /* `enable` has gone from 0 to 1 since the drive last failed */
@@ -115,29 +116,29 @@ struct epos2 {
     uint32_t sequence; /* complete sets of values */
 };
 
-/* The addresses from which the drive speaks, to be let through by the kernel's filter; their number. */
+/* The identifiers that the drive sends, for the filter of the kernel; returns their number. */
 enum { EPOS2_IDENTIFIERS = 6 };
 void epos2_identifiers(const struct epos2_settings *settings, uint32_t identifiers[EPOS2_IDENTIFIERS]);
 
 void epos2_begin(struct epos2 *drive, const struct epos2_settings *settings);
 
-/* The connection to the bus was interrupted: begin the drive anew at the next epos2_advance. */
+/* The connection to the bus was interrupted: set the drive up again in the next epos2_advance. */
 void epos2_lose(struct epos2 *drive);
 
-/* Take a frame that arrived at `at_ns`. Any may come; those that are not the drive's, or malformed, change nothing. */
+/* Take a frame that arrived at `at_ns`. Frames of others and malformed ones change nothing. */
 void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t at_ns);
 
-/* The frames to send now, in their order; their number. To be called once per period. */
+/* Write the frames to send now, in order; returns their number. Call it once per period. */
 size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_command *command,
                      struct can_frame out[EPOS2_FRAMES]);
 
-/* The frames that take the power off the motor, in every phase: by the PDO of the commands, by RPDO1, which carries the
- * control word alone, and by SDO, which no setting of the drive changes. So this also stops a drive that a program
- * before this one has left running. */
+/* Write the frames that take the power off the motor, in every phase: by the PDO of commands, by RPDO1, which carries
+ * the control word alone, and by SDO, which no setting of the drive changes. So this also stops a drive that an earlier
+ * program left running. */
 size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
 
-/* The frames after the last: powerless, and no longer waiting for our heartbeats. */
-size_t epos2_farewell(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
+/* Write the last frames: power off, and no monitoring of our heartbeats any more. */
+size_t epos2_shutdown(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
 
 /* The drive follows the target: it is enabled and says that it is in the mode asked for. */
 bool epos2_enabled(const struct epos2 *drive);

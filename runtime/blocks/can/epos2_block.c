@@ -1,5 +1,21 @@
-/* The block `epos2`: the drive of epos2.h on a CAN interface. A step takes what the kernel has stamped and
- * queued, and hands over what is to be sent, and neither can block; the thread of socket.h waits for the interface. */
+/** epos2
+ *
+ * Drives a motor by a Maxon EPOS2 controller on a CAN bus. The block configures the drive from any state, enables it,
+ * and commands it once a step. A step takes what the kernel has stamped and queued, and hands over what is to be sent;
+ * neither can block.
+ *
+ * Equations:
+ *   position in rad = quadrature counts·2π/(counts·gear)
+ *   motor speed in rpm = gear·60/(2π)·speed of the gear's output in rad/s
+ *
+ * Failure: A command whose `age` is beyond `timeout`, or that is not finite, stops the motor by a quick stop. When the
+ * task ends, in whatever way, the power is taken off the motor; a task that cannot do so is noticed by the drive,
+ * which stops the motor after `heartbeat` without a sign of the block. The flag is 0 while the drive is not in
+ * operation, silent for longer than `heartbeat`, or has sent no values for `timeout`, and while the interface is
+ * missing or down. While the flag is 0 the values stay the last good ones, and `age` grows. After a fault, or after
+ * the drive or the bus was lost, the motor stays off until `enable` goes from 0 to 1, or comes back by itself with
+ * `restart: automatic`. The journal says the first cause.
+ */
 #include "epos2.h"
 #include "epos2_text.h"
 #include "socket.h"
@@ -24,43 +40,43 @@ struct state {
     uint32_t connections;       /* of the interface, that the drive was begun on */
     struct fl_ring troubles;    /* from the step to the thread, for the journal */
     struct epos2_trouble known; /* the step has put into it */
-    struct epos2_trouble now, told;
+    struct epos2_trouble now, logged;
     int64_t since_ns; /* of `now` */
 };
 
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct epos2_block, interface, .flags = FL_EXCLUSIVE, .fallback = "can0",
+    FL_PARAMETER(struct epos2_block, interface, .flags = FL_EXCLUSIVE, .default_value = "can0",
                  .summary = "network interface of the bus"),
     FL_PARAMETER(struct epos2_block, node, .flags = FL_EXCLUSIVE, .min = 1, .max = 127,
                  .summary = "the drive's node address"),
-    FL_PARAMETER(struct epos2_block, master, .fallback = "127", .min = 1, .max = 127,
+    FL_PARAMETER(struct epos2_block, master, .default_value = "127", .min = 1, .max = 127,
                  .summary = "node address under which this block sends heartbeats: another for each drive"),
     FL_PARAMETER(struct epos2_block, mode, .choices = "position|velocity|current|profile-position|profile-velocity",
                  .summary = "what the target is"),
-    FL_PARAMETER(struct epos2_block, counts, .fallback = "2000", .min = 1, .max = 1e9,
+    FL_PARAMETER(struct epos2_block, counts, .default_value = "2000", .min = 1, .max = 1e9,
                  .summary = "quadrature counts of a turn of the motor: four times the encoder's pulses"),
-    FL_PARAMETER(struct epos2_block, gear, .fallback = "1", .min = 1e-6, .max = 1e6,
+    FL_PARAMETER(struct epos2_block, gear, .default_value = "1", .min = 1e-6, .max = 1e6,
                  .summary = "turns of the motor for one of the gear's output, where target and outputs are measured"),
-    FL_PARAMETER(struct epos2_block, heartbeat, .fallback = "0.1", .min = 0.006, .max = 60, .unit = "s",
-                 .summary = "longest silence that drive and block tolerate of each other"),
-    FL_PARAMETER(struct epos2_block, max_velocity, .fallback = "0", .min = 0, .max = 1e6, .unit = "rad/s",
+    FL_PARAMETER(struct epos2_block, heartbeat, .default_value = "0.1", .min = 0.006, .max = 60, .unit = "s",
+                 .summary = "time-out of the heartbeats between drive and block"),
+    FL_PARAMETER(struct epos2_block, max_velocity, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s",
                  .summary = "limit of velocity targets and profiles; 0 leaves what the drive has stored"),
-    FL_PARAMETER(struct epos2_block, acceleration, .fallback = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
+    FL_PARAMETER(struct epos2_block, acceleration, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
                  .summary = "of profiles, both ways; 0 leaves what the drive has stored"),
-    FL_PARAMETER(struct epos2_block, stop_deceleration, .fallback = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
+    FL_PARAMETER(struct epos2_block, stop_deceleration, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
                  .summary = "of a quick stop; 0 leaves what the drive has stored"),
-    FL_PARAMETER(struct epos2_block, max_current, .fallback = "0", .min = 0, .max = 32.767, .unit = "A",
+    FL_PARAMETER(struct epos2_block, max_current, .default_value = "0", .min = 0, .max = 32.767, .unit = "A",
                  .summary = "limit of the output current; 0 leaves what the drive has stored"),
-    FL_PARAMETER(struct epos2_block, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "0.1", .min = 1e-6, .max = 1e6,
-                 .unit = "s", .summary = "age from which a command, or a measurement, is too old"),
-    FL_PARAMETER(struct epos2_block, fault_reset, .fallback = "enable", .choices = "enable|automatic",
+    FL_PARAMETER(struct epos2_block, timeout, .flags = FL_ACTUATOR_TIMEOUT, .default_value = "0.1", .min = 1e-6,
+                 .max = 1e6, .unit = "s", .summary = "age from which a command, or a measurement, is too old"),
+    FL_PARAMETER(struct epos2_block, fault_reset, .default_value = "enable", .choices = "enable|automatic",
                  .summary = "what resets a fault: `enable` going from 0 to 1, or also the block, once a second"),
-    FL_PARAMETER(struct epos2_block, restart, .fallback = "enable", .choices = "enable|automatic",
+    FL_PARAMETER(struct epos2_block, restart, .default_value = "enable", .choices = "enable|automatic",
                  .summary = "what switches the motor on again after a fault, or after the drive or the bus was lost: "
                             "`enable` going from 0 to 1, or also the block, as soon as it can"),
-    FL_PARAMETER(struct epos2_block, sync, .fallback = "shared", .choices = "shared|none",
+    FL_PARAMETER(struct epos2_block, sync, .default_value = "shared", .choices = "shared|none",
                  .summary = "who sends SYNC: one of the blocks on the interface with `shared`, whatever tasks of this "
                             "computer they are in, once in its period; or another computer on the bus"),
 };
@@ -73,8 +89,9 @@ static const struct fl_port inputs[] = {
      .type = FL_DOUBLE,
      .width = 1,
      .unit = "s",
-     .summary = "age of the command, as good as none beyond `timeout`: the output `age` of its source, or 0 where it "
-                "is constant"},
+     .summary =
+         "age of the command, which counts as none beyond `timeout`: the output `age` of its source, or 0 where it "
+         "is constant"},
 };
 
 enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, FLAG };
@@ -132,19 +149,19 @@ static bool same(const struct epos2_trouble *a, const struct epos2_trouble *b)
     return a->cause == b->cause && a->code == b->code && a->index == b->index && a->sub == b->sub;
 }
 
-static void tell(struct fl_block *block, const struct epos2_trouble *trouble)
+static void log_trouble(struct fl_block *block, const struct epos2_trouble *trouble)
 {
     const struct epos2_block *set = block->parameters;
     int node = (int)set->node;
     switch (trouble->cause) {
     case EPOS2_NO_ANSWER:
-        fl_log(block, "drive %d does not answer: check its power, cable, node address and bit rate; trying on", node);
+        fl_log(block, "drive %d does not answer: check its power, cable, node address and bit rate; retrying", node);
         break;
     case EPOS2_NO_HEARTBEAT:
-        fl_log(block, "drive %d: no heartbeat for %g s: check its power and cable; trying on", node, set->heartbeat);
+        fl_log(block, "drive %d: no heartbeat for %g s: check its power and cable; retrying", node, set->heartbeat);
         break;
     case EPOS2_ABORTED:
-        fl_log(block, "drive %d refuses object %04X:%02X: SDO abort code %08X, %s; trying on", node, trouble->index,
+        fl_log(block, "drive %d refuses object %04X:%02X: SDO abort code %08X, %s; retrying", node, trouble->index,
                trouble->sub, (unsigned)trouble->code, epos2_abort_text(trouble->code));
         break;
     case EPOS2_EMERGENCY:
@@ -158,7 +175,7 @@ static void tell(struct fl_block *block, const struct epos2_trouble *trouble)
     }
 }
 
-/* By the thread. A trouble that returns at once, as a fault that is reset each second, is said once. */
+/* For the thread: log a trouble once, even if it returns at once, as a fault does that is reset each second. */
 static void watch(struct fl_block *block)
 {
     const int64_t fine_ns = INT64_C(2000000000);
@@ -169,18 +186,18 @@ static void watch(struct fl_block *block)
         can_sync_claim(&state->sync, set->interface);
     while (fl_ring_take(&state->troubles, &state->now)) {
         state->since_ns = now_ns;
-        if (state->now.cause == EPOS2_FINE || same(&state->now, &state->told))
+        if (state->now.cause == EPOS2_FINE || same(&state->now, &state->logged))
             continue;
-        tell(block, &state->now);
-        state->told = state->now;
+        log_trouble(block, &state->now);
+        state->logged = state->now;
     }
-    if (state->now.cause == EPOS2_FINE && state->told.cause != EPOS2_FINE && now_ns - state->since_ns >= fine_ns) {
-        tell(block, &state->now);
-        state->told = state->now;
+    if (state->now.cause == EPOS2_FINE && state->logged.cause != EPOS2_FINE && now_ns - state->since_ns >= fine_ns) {
+        log_trouble(block, &state->now);
+        state->logged = state->now;
     }
 }
 
-/* From the step to the thread. What does not fit is put by the next step. */
+/* Hand the trouble to the thread. If the ring is full, the next step does so. */
 static void report(struct state *state)
 {
     const struct epos2_trouble *trouble = &state->drive.trouble;
@@ -213,7 +230,7 @@ static int start(struct fl_block *block)
 
 static void send_all(struct state *state, const struct can_frame *frames, size_t count)
 {
-    /* A frame that the queue refuses is not kept: the next step knows better what to send. */
+    /* A frame that the queue refuses is not kept: the next step has newer ones. */
     for (size_t i = 0; i < count; i++)
         can_send(&state->can, &frames[i]);
 }
@@ -235,7 +252,7 @@ static void show(struct fl_block *block, struct state *state)
     FL_OUT(block, ENABLED, uint8_t) = FL_OUT(block, FLAG, bool) && epos2_enabled(drive);
 }
 
-/* A drive that could not be reached for a while is in any state: it is begun anew. */
+/* A drive that could not be reached may be in any state, so set it up again. */
 static void follow_interface(struct state *state)
 {
     uint32_t connections = atomic_load(&state->can.connections);
@@ -258,7 +275,7 @@ static int step(struct fl_block *block)
                                     .sync = atomic_load(&state->sync.mine),
                                     .target = fresh ? FL_IN(block, TARGET, double) : (double)NAN};
     follow_interface(state);
-    /* On an interface that is away nothing is begun: what a driver has queued would reach the drive late. */
+    /* While the interface is missing, start nothing: frames queued by its driver would reach the drive late. */
     if (can_connected(&state->can))
         send_all(state, out, epos2_advance(&state->drive, block->release_ns, &command, out));
     report(state);
@@ -277,7 +294,7 @@ static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    send_all(state, out, epos2_farewell(&state->drive, out));
+    send_all(state, out, epos2_shutdown(&state->drive, out));
     can_stop(&state->can);
     can_sync_release(&state->sync);
 }

@@ -1,7 +1,7 @@
 #define _GNU_SOURCE
 #include "socket.h"
 
-#include "drivers/wall_clock.h"
+#include "core/wall_clock.h"
 
 #include <errno.h>
 #include <linux/can/error.h>
@@ -80,12 +80,12 @@ static int look(struct can_socket *can)
 }
 
 /* Say each state once, not ten times a second. */
-static void tell(struct can_socket *can, int state)
+static void log_state(struct can_socket *can, int state)
 {
     const char *interface = can->interface;
-    if (state == can->told)
+    if (state == can->logged)
         return;
-    can->told = state;
+    can->logged = state;
     switch (state) {
     case UP:
         fl_log(can->block, "CAN interface %s is up", interface);
@@ -101,7 +101,7 @@ static void tell(struct can_socket *can, int state)
                interface);
         break;
     case NO_CAN:
-        fl_log(can->block, "%s is no CAN interface: set the parameter `interface`", interface);
+        fl_log(can->block, "%s is not a CAN interface: set the parameter `interface`", interface);
         break;
     case MISSING:
         fl_log(can->block,
@@ -110,11 +110,11 @@ static void tell(struct can_socket *can, int state)
         break;
     case EAFNOSUPPORT:
     case EPROTONOSUPPORT:
-        fl_log(can->block, "CAN interface %s: the kernel has no CAN: load the modules can and can-raw; trying on",
+        fl_log(can->block, "CAN interface %s: the kernel has no CAN: load the modules can and can-raw; retrying",
                interface);
         break;
     default:
-        fl_log(can->block, "CAN interface %s: %s; trying on", interface, strerror(state));
+        fl_log(can->block, "CAN interface %s: %s; retrying", interface, strerror(state));
         break;
     }
 }
@@ -123,12 +123,12 @@ static void update(struct can_socket *can)
 {
     if (!atomic_load(&can->up)) {
         atomic_store(&can->bus_off, false); /* an interface that comes up begins anew */
-        if (can->told <= BUS_OFF)
-            can->told = UNKNOWN; /* however short it was gone, it is said */
+        if (can->logged <= BUS_OFF)
+            can->logged = UNKNOWN; /* log the interruption, however short */
     }
     int state = look(can);
     bool up = state == UP || state == BUS_OFF;
-    tell(can, state);
+    log_state(can, state);
     if (up && !atomic_load(&can->up))
         atomic_fetch_add(&can->connections, 1);
     atomic_store(&can->up, up);
@@ -154,7 +154,7 @@ int can_start(struct fl_block *block, struct can_socket *can, const char *interf
     if (count)
         memcpy(can->filters, filters, count * sizeof *filters);
     can->filter_count = count;
-    can->told = UNKNOWN;
+    can->logged = UNKNOWN;
     update(can); /* one that is there is used from the first step on */
     can->driver = fl_driver_start(block, run, can);
     return can->driver ? FL_OK : FL_FAILED;
@@ -176,7 +176,7 @@ bool can_connected(const struct can_socket *can)
     return atomic_load(&can->up);
 }
 
-/* Whether an interface went away shows here first, and only here if it is back within the thread's next look. */
+/* A step notices first that an interface was removed; the thread would miss it if it is back before its next look. */
 static void judge(struct can_socket *can, int error)
 {
     if (error == ENETDOWN || error == ENODEV || error == ENXIO)

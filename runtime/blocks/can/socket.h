@@ -1,9 +1,10 @@
 /* A SocketCAN raw socket (Linux, Documentation/networking/can.rst) with the kernel's filters and time stamps, which
- * never blocks the step, and the thread that waits for its interface.
+ * never blocks the step, and a thread that waits for its interface.
  *
- * The interface need not be there when the block starts: the thread looks for it ten times a second, binds the socket
- * as soon as it appears, again whenever it was removed, and says once in the journal what is missing and what to do
- * about it. The descriptor stays the same as long as the block lives, so the step can use it at any time. */
+ * The interface may be missing when the block starts. The thread looks for it ten times a second, binds the socket when
+ * it appears, also after it was removed, and logs once what is missing and what to do about it. The descriptor stays
+ * the same as long as the block lives, so the step can use it at any time.
+ */
 #ifndef FLOTILLA_CAN_SOCKET_H
 #define FLOTILLA_CAN_SOCKET_H
 
@@ -24,12 +25,12 @@ struct can_socket {
     /* Between thread and step. */
     _Atomic int fd;               /* 0 until the kernel has given a socket */
     _Atomic bool up;              /* the interface is there and up, and the socket bound to it */
-    _Atomic bool bus_off;         /* the controller left the bus; until a frame arrives, or it says it was restarted */
+    _Atomic bool bus_off;         /* the controller is bus-off, until a frame arrives or it reports a restart */
     _Atomic uint32_t connections; /* how often the interface came up */
 
     /* The thread's. */
     unsigned bound; /* index of the interface; 0: none */
-    int told;       /* the state that the journal has */
+    int logged;     /* the state that was logged last */
 };
 
 /* Wait for `interface`, and receive frames that pass one of `filters` (at most CAN_FILTERS, copied), and the

@@ -1,7 +1,8 @@
-/* Who sends SYNC on a bus: one of the blocks of this computer at a time, in whatever tasks they are.
+/* Decides which block sends SYNC on a bus: one block of this computer at a time, in any task.
  *
- * The claim is an abstract Unix address named after the interface, which one socket can have. Like the interface it is
- * of the network namespace, and the kernel frees it when its process ends, however it ends. */
+ * The claim is an abstract Unix address named after the interface, which only one socket can have. Like the interface
+ * it is local to the network namespace, and the kernel releases it when the process ends, in whatever way.
+ */
 #ifndef FLOTILLA_CAN_SYNC_H
 #define FLOTILLA_CAN_SYNC_H
 
@@ -13,10 +14,10 @@ struct can_sync {
     _Atomic bool mine;
 };
 
-/* Claim the SYNC of `interface` unless it is mine already; another block may have it. Not in a step. */
+/* Claim the SYNC of `interface` unless this block has it already; another block may have it. Not in a step. */
 void can_sync_claim(struct can_sync *sync, const char *interface);
 
-/* Give it to whoever claims it next. */
+/* Release the claim for the next block. */
 void can_sync_release(struct can_sync *sync);
 
 #endif

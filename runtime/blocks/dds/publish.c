@@ -1,3 +1,12 @@
+/** dds-publish
+ *
+ * Publishes its input as a sample of a DDS topic, in each step or whenever `sequence` changes. The step puts the
+ * sample into a ring; a thread gives it to DDS, which may allocate and block.
+ *
+ * Failure: No step waits for DDS. A sample that is older than `lifespan` when its turn comes is dropped, as is all but
+ * the newest of those that wait. `written` counts what DDS took. While DDS cannot be had the thread tries again every
+ * second, and writes to the journal. While `withhold` is 1 the block is silent, so that subscribers fail over.
+ */
 #define _GNU_SOURCE
 #include "topic.h"
 
@@ -26,15 +35,15 @@ struct state {
     void *storage;
     int wake[2]; /* a byte for each sample: the step's end, and the thread's */
     uint32_t number;
-    uint32_t sequence; /* in the step before; 0: nothing has come yet, or nothing is wired */
+    uint32_t sequence; /* sequence in the step before; 0: nothing has come yet, or the input has no wire */
     _Atomic uint32_t peers, written;
 };
 
 static const struct fl_parameter parameters[] = {
     DDS_PARAMETERS(struct dds_settings),
     FL_PARAMETER(struct dds_publish, robot, .min = 0, .max = 65535, .summary = "number of the robot that sends"),
-    FL_PARAMETER(struct dds_publish, lifespan, .fallback = "0.1", .min = 0.001, .max = 3600, .unit = "s",
-                 .summary = "a sample that is older is not sent, nor sent again: it would look new where it arrives"),
+    FL_PARAMETER(struct dds_publish, lifespan, .default_value = "0.1", .min = 0.001, .max = 3600, .unit = "s",
+                 .summary = "older samples are not sent, nor sent again: they would look new to the subscriber"),
 };
 
 enum { WITHHOLD, SEQUENCE, DATA };
@@ -44,7 +53,7 @@ static const struct fl_port inputs[] = {
      .type = FL_UINT32,
      .width = 1,
      .flags = FL_OPTIONAL,
-     .summary = "of what the data are made of: nothing is published in a step to which it brought nothing new"},
+     .summary = "sequence of the input that the data are made from: publish only when it has changed"},
 };
 
 enum { PEERS, WRITTEN };
@@ -60,8 +69,8 @@ static void matched(dds_entity_t writer, const dds_publication_matched_status_t 
     atomic_store(&state->peers, status.current_count);
 }
 
-/* The newest that waits is written; those before it are worth nothing any more, nor is what waited too long: for DDS,
- * or for a process that was stopped. */
+/* Write the newest waiting sample. Older ones are useless, as is one that waited too long for DDS, or in a stopped
+ * process. */
 static void write_newest(struct state *state, dds_entity_t writer)
 {
     const struct dds_publish *set = state->block->parameters;
@@ -83,8 +92,9 @@ static void set_listener(dds_listener_t *listener)
     dds_lset_publication_matched(listener, matched);
 }
 
-/* A best-effort writer keeps no sample, and so no instance: DDS would make the robot's anew for each sample, and its
- * garbage collector, at the same priority, take it away again. What is registered stays until the participant goes. */
+/* A best-effort writer keeps no sample, and so no instance. DDS would create the instance for each sample, and its
+ * garbage collector, at the same priority, remove it again. A registered instance stays until the participant is
+ * deleted. */
 static void keep_instance(struct state *state, dds_entity_t writer)
 {
     const struct dds_publish *set = state->block->parameters;

@@ -1,3 +1,13 @@
+/** dds-subscribe
+ *
+ * Gives the newest sample that a robot published on a DDS topic, or that a hot standby of it did. The block can
+ * trigger a task.
+ *
+ * Failure: The flag is 0 once the newest sample is older than `timeout`, or than `deadline` where that is shorter.
+ * While the flag is 0 the values stay the last good ones, and `age` grows. With several robots, one is listened to
+ * once those before it have been silent for longer than `failover`. While DDS cannot be had the block tries again
+ * every second, and writes to the journal.
+ */
 #define _GNU_SOURCE
 #include "topic.h"
 
@@ -14,7 +24,7 @@ enum { WAITING = 16, BATCH = 8 };
 
 struct dds_subscribe {
     struct dds_settings common;
-    struct fl_reals robot;
+    struct fl_doubles robot;
     double failover, timeout;
 };
 
@@ -26,7 +36,7 @@ struct state {
     struct fl_ring samples;
     struct dds_sample arriving, taken; /* DDS's thread's, the step's */
     int arrived_fd;                    /* readable after something was put into the ring */
-    bool open, awaited;                /* awaited: await takes, not the step */
+    bool open, awaited;                /* awaited: await takes samples instead of the step */
     _Atomic uint32_t peers;
     struct fl_sensor sensor;
 };
@@ -48,8 +58,8 @@ static void matched(dds_entity_t reader, const dds_subscription_matched_status_t
     atomic_store(&state->peers, status.current_count);
 }
 
-/* The place of the sample's robot among those that are listened to, or their number. */
-static size_t rank_of(const struct fl_reals *robots, const struct dds_sample *sample)
+/* The rank of the robot that sent the sample, or the number of ranks if it is not listened to. */
+static size_t rank_of(const struct fl_doubles *robots, const struct dds_sample *sample)
 {
     size_t rank = 0;
     while (rank < robots->count && lround(robots->value[rank]) != sample->robot)
@@ -57,7 +67,8 @@ static size_t rank_of(const struct fl_reals *robots, const struct dds_sample *sa
     return rank;
 }
 
-/* Called by DDS, one call at a time for a reader. A topic carries the samples of all robots; one's are wanted. */
+/* Called by DDS, one call at a time for a reader. A topic carries the samples of all robots: keep those of the right
+ * one. */
 static void arrived(dds_entity_t reader, void *context)
 {
     struct state *state = context;
@@ -112,14 +123,17 @@ static int configure(struct fl_block *block)
         {.name = "number", .type = FL_UINT32, .width = 1, .summary = "the sender's count of its samples"},
         {.name = "stamp", .type = FL_INT64, .width = 1, .unit = "ns", .summary = "the sender's fleet time"},
         {.name = "peers", .type = FL_UINT32, .width = 1, .summary = "publishers of the topic that are known now"},
-        {.name = "sender", .type = FL_UINT32, .width = 1, .summary = "who is listened to: 0 is the first of `robot`"},
+        {.name = "sender",
+         .type = FL_UINT32,
+         .width = 1,
+         .summary = "rank of the sender that is listened to: 0 is the first of `robot`"},
         FL_SENSOR_OUTPUTS,
     };
     if (set->robot.count < 1 || set->robot.count > FL_SENDERS)
         return fl_fail(block, "parameter robot: give 1 to %d numbers", FL_SENDERS);
     for (size_t i = 0; i < set->robot.count; i++)
         if (set->robot.value[i] != floor(set->robot.value[i]))
-            return fl_fail(block, "parameter robot: %g is no whole number", set->robot.value[i]);
+            return fl_fail(block, "parameter robot: %g is not a whole number", set->robot.value[i]);
     for (size_t i = 0; i < sizeof outputs / sizeof outputs[0]; i++)
         if (fl_add_output(block, outputs[i]) != FL_OK)
             return FL_FAILED;
@@ -161,8 +175,7 @@ static int64_t take(struct fl_block *block)
     return taken_ns;
 }
 
-/* It takes for the step, which could find a newer sample than the one that releases it, and tell that this one came
- * before it was sent. */
+/* Take the sample here instead of in the step: the step could find a newer one than the sample that triggered it. */
 static int64_t await(struct fl_block *block, int64_t until_ns)
 {
     struct state *state = block->state;
@@ -183,7 +196,7 @@ static int step(struct fl_block *block)
     if (!state->awaited)
         take(block);
     FL_OUT(block, PEERS, uint32_t) = atomic_load(&state->peers);
-    /* By the age of what was taken: DDS's own status tells of any robot whose samples come by the topic. */
+    /* Go by the age of the sample: the status of DDS covers all robots that publish the topic. */
     const double deadline = set->common.deadline;
     fl_sensor_outputs(&state->sensor, block, FLAG, true, deadline > 0 ? fmin(deadline, set->timeout) : set->timeout);
     return FL_OK;
@@ -200,7 +213,7 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(dds_subscribe) = {
     .abi = FL_ABI,
     .name = "dds-subscribe",
-    .summary = "the newest sample that a robot published on a DDS topic, or one that stands by for it",
+    .summary = "the newest sample that a robot, or its hot standby, published on a DDS topic",
     .source = "OMG DDS 1.4; DDSI-RTPS 2.5; Eclipse Cyclone DDS 0.10",
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct dds_subscribe),

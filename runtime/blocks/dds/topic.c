@@ -100,7 +100,7 @@ static struct {
     dds_entity_t participant;
 } participants[DOMAINS];
 
-/* Made by the first that asks; negative: a DDS error. Each success is to be released. */
+/* Get the participant, which the first caller creates; negative: a DDS error. Release it after success. */
 static dds_entity_t have_participant(uint32_t domain)
 {
     dds_entity_t result = DDS_RETCODE_OUT_OF_RESOURCES;
@@ -135,7 +135,7 @@ enum { RETRY_MS = 1000 };
 static dds_qos_t *qualities_of(const struct dds_settings *settings, double lifespan)
 {
     dds_qos_t *qualities = dds_create_qos();
-    dds_qset_history(qualities, DDS_HISTORY_KEEP_LAST, 1); /* control wants the newest or none */
+    dds_qset_history(qualities, DDS_HISTORY_KEEP_LAST, 1); /* control needs the newest sample only */
     dds_qset_reliability(qualities, settings->reliability ? DDS_RELIABILITY_RELIABLE : DDS_RELIABILITY_BEST_EFFORT,
                          DDS_MSECS(100));
     if (settings->deadline > 0)
@@ -145,7 +145,7 @@ static dds_qos_t *qualities_of(const struct dds_settings *settings, double lifes
     return qualities;
 }
 
-/* Until the thread shall return: true; or false when DDS cannot be had now. */
+/* Serve until the thread has to return: true; false when DDS is not available now. */
 static bool serve(const struct dds_endpoint *endpoint, const struct dds_settings *settings, double lifespan,
                   struct fl_block *block, struct fl_driver *driver, void *context, dds_entity_t participant)
 {

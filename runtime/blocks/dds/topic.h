@@ -1,9 +1,9 @@
-/* What publisher and subscriber have in common: the types of runtime/idl/flotilla.idl as ports, qualities of service,
- * and the participant, which all blocks of a program and domain share.
+/* What publisher and subscriber share: the types of runtime/idl/flotilla.idl as ports, qualities of service, and the
+ * participant, of which a program has one for each domain.
  *
- * DDS allocates and may take milliseconds now and then, so no step calls it: samples pass through rings, and a thread
- * of the block's or of DDS's own is on the other side. Addresses, peers, interfaces and priorities are the business of
- * $CYCLONEDDS_URI, which the robot's configuration sets for all its tasks. */
+ * DDS allocates and may take milliseconds, so no step calls it: samples pass through rings to and from a thread of the
+ * block or of DDS. $CYCLONEDDS_URI sets addresses, peers, interfaces and priorities for all tasks of a robot.
+ */
 #ifndef FLOTILLA_DDS_TOPIC_H
 #define FLOTILLA_DDS_TOPIC_H
 
@@ -34,14 +34,14 @@ struct dds_settings {
     FL_PARAMETER(block_type, type, .choices = "state|wrench|valves|bytes",                                             \
                  .summary = "type of the topic, of flotilla.idl"),                                                     \
         FL_PARAMETER(block_type, topic, .summary = "name of the topic"),                                               \
-        FL_PARAMETER(block_type, domain, .fallback = "0", .min = 0, .max = 230,                                        \
+        FL_PARAMETER(block_type, domain, .default_value = "0", .min = 0, .max = 230,                                   \
                      .summary = "DDS domain: tasks of different domains do not see each other"),                       \
-        FL_PARAMETER(block_type, bytes, .fallback = "64", .min = 1, .max = DDS_VALUES, .unit = "B",                    \
+        FL_PARAMETER(block_type, bytes, .default_value = "64", .min = 1, .max = DDS_VALUES, .unit = "B",               \
                      .summary = "length of a sample of type `bytes`"),                                                 \
-        FL_PARAMETER(block_type, reliability, .fallback = "best-effort", .choices = "best-effort|reliable",            \
+        FL_PARAMETER(block_type, reliability, .default_value = "best-effort", .choices = "best-effort|reliable",       \
                      .summary = "whether lost samples are sent again, as long as they are the newest"),                \
-        FL_PARAMETER(block_type, deadline, .fallback = "0", .min = 0, .max = 1e6, .unit = "s",                         \
-                     .summary = "longest time between samples that is promised, or asked for; 0: none")
+        FL_PARAMETER(block_type, deadline, .default_value = "0", .min = 0, .max = 1e6, .unit = "s",                    \
+                     .summary = "DDS deadline: longest time between samples; 0: none")
 
 /* The port that carries the type's values. */
 struct fl_port dds_port(const struct dds_settings *settings);
@@ -59,12 +59,13 @@ bool dds_decode(const struct dds_settings *settings, const void *storage, struct
 struct dds_endpoint {
     dds_entity_t (*create)(dds_entity_t participant, dds_entity_t topic, const dds_qos_t *qualities,
                            const dds_listener_t *listener);
-    void (*set_listener)(dds_listener_t *listener); /* say what is to be called, with the context given to dds_run */
-    void (*serve)(void *context, struct fl_driver *driver, dds_entity_t entity); /* until the thread shall return */
+    void (*set_listener)(dds_listener_t *listener); /* set the callbacks, with the context given to dds_run */
+    void (*serve)(void *context, struct fl_driver *driver,
+                  dds_entity_t entity); /* serve until the thread has to return */
 };
 
-/* What a block's thread does: have the endpoint, and serve it; try again while DDS cannot be had. `lifespan` of a
- * writer's samples, in s: 0 is for readers. */
+/* The thread of a block: create the endpoint and serve it; try again while DDS is not available. `lifespan` of samples
+ * that are written, in s: 0 for readers. */
 void dds_run(const struct dds_endpoint *endpoint, const struct dds_settings *settings, double lifespan,
              struct fl_block *block, struct fl_driver *driver, void *context);
 

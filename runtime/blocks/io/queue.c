@@ -8,9 +8,9 @@
 #include <string.h>
 #include <sys/stat.h>
 
-/* Who uses a queue is kept in locks on its bytes, which the kernel drops with the process, however it ends: one for
- * each end, and one that opening and closing hold meanwhile, so that they happen one after the other. A mqd_t of Linux
- * is a file descriptor, and locks of open file descriptions (fcntl(2)) work on it. */
+/* Locks on bytes of a queue record who uses it; the kernel drops them with the process, however it ends. There is one
+ * for each end, and one that is held while a queue is opened or closed, so that this happens one at a time. A mqd_t of
+ * Linux is a file descriptor, and locks of open file descriptions (fcntl(2)) work on it. */
 enum { LOCK_ENDS = 0, LOCK_CHANGE = 2 };
 
 static bool lock(mqd_t descriptor, off_t from, off_t count, short kind, bool wait)
@@ -19,7 +19,7 @@ static bool lock(mqd_t descriptor, off_t from, off_t count, short kind, bool wai
     return fcntl(descriptor, wait ? F_OFD_SETLKW : F_OFD_SETLK, &range) == 0;
 }
 
-/* Whether nobody but the holder of this descriptor uses the queue; nobody else can begin to then. */
+/* Whether only the holder of this descriptor uses the queue; then nobody else can begin to. */
 static bool is_ours_alone(mqd_t descriptor)
 {
     return lock(descriptor, LOCK_ENDS, 2, F_WRLCK, false);
@@ -61,7 +61,7 @@ static int fail_to_open(struct fl_block *block, const struct queue *queue, int64
 
 enum opened { OPENED, FAILED, AGAIN };
 
-/* With the change lock held: judge what was opened, and take the lock of this end. */
+/* With the change lock held: check the opened queue, and take the lock of this end. */
 static enum opened settle(struct queue *queue, struct fl_block *block, enum queue_end end, int64_t depth)
 {
     struct mq_attr found;
@@ -117,7 +117,7 @@ int queue_open(struct queue *queue, struct fl_block *block, enum queue_end end, 
     queue->message = fl_allocate(block, queue->message_bytes);
     if (!queue->message)
         return FL_FAILED;
-    do /* again only where somebody has just removed the queue */
+    do /* try again only if another process has just removed the queue */
         opened = open_once(queue, block, end, depth);
     while (opened == AGAIN);
     queue->open = opened == OPENED;
@@ -141,7 +141,8 @@ void queue_close(struct queue *queue)
 {
     if (!queue->open)
         return;
-    /* The kernel releases the locks with the descriptor. Who is just opening holds the change lock, and keeps it. */
+    /* Closing the descriptor releases the locks. A process that is just opening the queue holds the change lock, and
+     * keeps the queue. */
     if (lock(queue->descriptor, LOCK_CHANGE, 1, F_WRLCK, false) && is_ours_alone(queue->descriptor) &&
         !is_removed(queue->descriptor))
         mq_unlink(queue->name);

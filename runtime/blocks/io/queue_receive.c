@@ -1,3 +1,11 @@
+/** queue-receive
+ *
+ * Receives the signal of a queue-send block in another task of this computer. `age` counts from when it was sent.
+ *
+ * Failure: The flag is 0 once the newest message is older than `timeout`. While the flag is 0 the values stay the last
+ * good ones, and `age` grows. Messages of another type or width are counted in `refused`, those missing in the
+ * sender's count in `dropped`. A queue that cannot be opened, or that another block receives from, fails the start.
+ */
 #include "queue.h"
 
 #include <flotilla/sensor.h>
@@ -13,7 +21,7 @@ enum take { NEWEST, IN_ORDER };
 
 static const struct fl_parameter parameters[] = {
     QUEUE_PARAMETERS(struct queue_receive),
-    FL_PARAMETER(struct queue_receive, take, .fallback = "newest", .choices = "newest|in-order",
+    FL_PARAMETER(struct queue_receive, take, .default_value = "newest", .choices = "newest|in-order",
                  .summary = "each step takes the newest message, or the next one that waits"),
     FL_SENSOR_TIMEOUT(struct queue_receive, "0.1"),
 };
@@ -52,7 +60,7 @@ static int start(struct fl_block *block)
                    receive->depth) != FL_OK)
         return FL_FAILED;
     for (int64_t i = 0; i < receive->depth && queue_take(&state->queue); i++)
-        ; /* what waited may be of a task that ended long ago */
+        ; /* waiting messages may be from a task that ended long ago */
     return FL_OK;
 }
 
@@ -63,7 +71,7 @@ static void accept(struct fl_block *block, struct state *state)
         FL_OUT(block, REFUSED, uint32_t)++;
         return;
     }
-    /* A count that is not ahead is of a sender that has started again. */
+    /* A count that did not increase is from a sender that has restarted. */
     if (state->last && message->sequence > state->last)
         FL_OUT(block, DROPPED, uint32_t) += message->sequence - state->last - 1;
     state->last = message->sequence;

@@ -1,3 +1,10 @@
+/** queue-send
+ *
+ * Sends a signal to a queue-receive block in another task of this computer, once a step.
+ *
+ * Failure: No step waits. When the queue is full the oldest or the newest message is dropped, by `full`, and counted
+ * in `dropped`. A queue that cannot be opened, or that another block sends to, fails the start.
+ */
 #include "queue.h"
 
 #include <string.h>
@@ -11,8 +18,8 @@ enum full { DROP_OLDEST, DROP_NEWEST };
 
 static const struct fl_parameter parameters[] = {
     QUEUE_PARAMETERS(struct queue_send),
-    FL_PARAMETER(struct queue_send, full, .fallback = "drop-oldest", .choices = "drop-oldest|drop-newest",
-                 .summary = "which message makes way when the receiver does not keep up"),
+    FL_PARAMETER(struct queue_send, full, .default_value = "drop-oldest", .choices = "drop-oldest|drop-newest",
+                 .summary = "which message is dropped when the queue is full"),
 };
 
 static const struct fl_port outputs[] = {

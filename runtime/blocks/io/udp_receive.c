@@ -1,4 +1,14 @@
-#include "udp.h"
+/** udp-receive
+ *
+ * Receives datagrams of one length, at most 64 in a step. They are stamped by the kernel when they arrive. The block
+ * can trigger a task.
+ *
+ * Failure: The flag is 0 once no datagram was taken for `timeout`. While the flag is 0 the values stay the last good
+ * ones, and `age` grows. Datagrams of another length or sender are counted in `refused`, those lost to a full queue in
+ * `dropped`. With several senders, one is listened to once those before it have been silent for longer than
+ * `failover`. The interface and the local address may come later, go, and come back.
+ */
+#include "core/udp.h"
 
 #include <flotilla/driver.h>
 #include <flotilla/sensor.h>
@@ -17,7 +27,7 @@ static const struct fl_parameter parameters[] = {
     UDP_RECEIVER_PARAMETERS(struct udp_receive),
     FL_PARAMETER(struct udp_receive, length, .min = 1, .max = UDP_LONGEST, .unit = "B",
                  .summary = "payload of a datagram; one of another length is refused"),
-    FL_PARAMETER(struct udp_receive, take, .fallback = "newest", .choices = "newest|in-order",
+    FL_PARAMETER(struct udp_receive, take, .default_value = "newest", .choices = "newest|in-order",
                  .summary = "each step takes the newest datagram, or the next one that waits"),
     FL_SENSOR_TIMEOUT(struct udp_receive, "0.1"),
 };
@@ -76,8 +86,8 @@ static int64_t take(struct fl_block *block)
     return taken_ns;
 }
 
-/* It takes for the step, which could find a newer datagram than the one that releases it, and tell that this one came
- * before it was sent. What is not listened to is no reason for a step. */
+/* Take the datagram here instead of in the step: the step could find a newer one than the datagram that triggered it.
+ * Datagrams that are not accepted do not trigger a step. */
 static int64_t await(struct fl_block *block, int64_t until_ns)
 {
     struct state *state = block->state;

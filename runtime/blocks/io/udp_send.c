@@ -1,4 +1,12 @@
-#include "udp.h"
+/** udp-send
+ *
+ * Sends a datagram in each step, or whenever `sequence` changes, to one computer, to several, or to all in reach.
+ *
+ * Failure: No step waits. A datagram that the network does not take (interface or route missing, queue full) is
+ * counted in `failed`, and not sent again. The interface and the local address may come later, go, and come back.
+ * While `withhold` is 1 the block is silent, so that receivers fail over.
+ */
+#include "core/udp.h"
 
 #include <arpa/inet.h>
 #include <errno.h>
@@ -7,7 +15,7 @@
 #include <unistd.h>
 
 struct udp_send {
-    struct fl_texts address;
+    struct fl_strings address;
     int64_t port;
     UDP_LOCAL_MEMBERS;
     int64_t length;
@@ -20,11 +28,11 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct udp_send, port, .min = 1, .max = 65535, .summary = "UDP port to send to"),
     UDP_LOCAL_PARAMETERS(struct udp_send),
     FL_PARAMETER(struct udp_send, length, .min = 1, .max = UDP_LONGEST, .unit = "B",
-                 .summary = "payload of a datagram; it shall fit one frame"),
-    FL_PARAMETER(struct udp_send, broadcast, .fallback = "false",
+                 .summary = "payload of a datagram; it has to fit one frame"),
+    FL_PARAMETER(struct udp_send, broadcast, .default_value = "false",
                  .summary = "whether `address` may be the broadcast address of a network"),
-    FL_PARAMETER(struct udp_send, dscp, .fallback = "0", .min = 0, .max = 63,
-                 .summary = "class of service (RFC 2474); 46 is voice to 802.11, which goes first"),
+    FL_PARAMETER(struct udp_send, dscp, .default_value = "0", .min = 0, .max = 63,
+                 .summary = "class of service (RFC 2474); 802.11 sends 46, voice, first"),
 };
 
 static const struct fl_port inputs[] = {
@@ -33,7 +41,7 @@ static const struct fl_port inputs[] = {
      .type = FL_UINT32,
      .width = 1,
      .flags = FL_OPTIONAL,
-     .summary = "of what the data are made of: nothing is sent in a step to which it brought nothing new"},
+     .summary = "sequence of the input that the data are made from: send only when it has changed"},
 };
 
 static const struct fl_port outputs[] = {
@@ -47,10 +55,10 @@ static const struct fl_port outputs[] = {
 enum { WITHHOLD, SEQUENCE, DATA };
 enum { SENT, FAILED };
 
-/* A socket each: what waits for the hardware address of a computer that is gone fills its socket. */
+/* One socket for each address: datagrams that wait for the hardware address of a missing computer fill their socket. */
 struct state {
     struct udp_sockets sockets;
-    uint32_t sequence; /* in the step before; 0: nothing has come yet, or nothing is wired */
+    uint32_t sequence; /* sequence in the step before; 0: nothing has come yet, or the input has no wire */
     struct sockaddr_in to[FL_SENDERS];
 };
 
@@ -63,7 +71,7 @@ static int configure(struct fl_block *block)
         return FL_FAILED;
     for (size_t i = 0; i < udp->address.count; i++) {
         if (to[i].s_addr == INADDR_ANY)
-            return fl_fail(block, "parameter address: 0.0.0.0 is nowhere to send to");
+            return fl_fail(block, "parameter address: 0.0.0.0 is not an address to send to");
         if (to[i].s_addr == INADDR_BROADCAST && !udp->broadcast)
             return fl_fail(block, "parameter address: %s is a broadcast address; allow it by broadcast: true",
                            udp->address.value[i]);
@@ -74,8 +82,8 @@ static int configure(struct fl_block *block)
                                                 .summary = "payload, sent each step"});
 }
 
-/* Which addresses are broadcasts only the routes of this computer tell: connecting a socket of its own asks for it and
- * sends nothing. Without a route there may be one later: that is no failure. */
+/* Only the routes of this computer say which addresses are broadcasts. Connecting a separate socket checks that, and
+ * sends nothing. Without a route there may be one later, so that is not a failure. */
 static int refuse_broadcast(struct fl_block *block, const struct sockaddr_in *to, const char *address)
 {
     int fd = socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);

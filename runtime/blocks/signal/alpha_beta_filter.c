@@ -1,3 +1,18 @@
+/** alpha-beta-filter
+ *
+ * Estimates value and rate of a moving quantity from noisy measurements, each element by itself. Between two
+ * measurements it predicts from the rate and from the acceleration, where that is known.
+ *
+ * Equations:
+ *   T: time since the step before, in s; P: time since the last measurement that was taken, in s
+ *   every step:         value += rate·T + acceleration·T²/2,  rate += acceleration·T
+ *   a new measurement:  r = measurement − value,  value += α·r,  rate += β·r/P
+ *   θ = exp(−P/time_constant),  α = 1 − θ²,  β = (1 − θ)²;  for the first measurement α = 1, β = 0
+ *
+ * Failure: A measurement is taken only when `sequence` has changed and all of its elements are finite; otherwise the
+ * block goes on predicting. An acceleration that is not finite counts as zero. Go by the sensor's flag, this block has
+ * none.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 
@@ -18,8 +33,8 @@ struct state {
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct alpha_beta_filter, time_constant, .flags = FL_TUNABLE, .min = 1e-6, .max = INFINITY,
                  .unit = "s",
-                 .summary = "in which what was measured before counts less by 63 %: longer is smoother and slower"),
-    FL_PARAMETER(struct alpha_beta_filter, width, .fallback = "1", .min = 1, .max = 64,
+                 .summary = "time constant of forgetting older measurements: longer is smoother and slower"),
+    FL_PARAMETER(struct alpha_beta_filter, width, .default_value = "1", .min = 1, .max = 64,
                  .summary = "elements of the measurement"),
 };
 
@@ -112,8 +127,7 @@ static int step(struct fl_block *block)
 FL_BLOCK(alpha_beta_filter) = {
     .abi = FL_ABI,
     .name = "alpha-beta-filter",
-    .summary =
-        "value and rate of what moves, from noisy measurements: inputs measurement, sequence; outputs value, rate",
+    .summary = "estimates value and rate from noisy measurements: inputs measurement, sequence; outputs value, rate",
     .source = "Brookner, Tracking and Kalman Filtering Made Easy, section 1.3: the critically damped g-h filter",
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct alpha_beta_filter),

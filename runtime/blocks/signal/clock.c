@@ -1,4 +1,15 @@
-#include "drivers/wall_clock.h"
+/** clock
+ *
+ * Gives the time of the step by the monotonic clock, which is never set, and by the wall clock.
+ *
+ * Equations:
+ *   time = monotonic_ns − monotonic_ns of the first step, in s
+ *   wall_ns = monotonic_ns + offset_ns
+ *
+ * Failure: Cannot fail. When the wall clock is set, `offset_ns`, `wall_ns` and `wall` jump; `time` and `monotonic_ns`
+ * never do.
+ */
+#include "core/wall_clock.h"
 
 #include <flotilla/block.h>
 
@@ -13,7 +24,7 @@ static const struct fl_port inputs[] = {
      .type = FL_BOOLEAN,
      .width = 1,
      .flags = FL_OPTIONAL,
-     .summary = "lets it run after another block"},
+     .summary = "wire any flag here to run after its block"},
 };
 
 static const struct fl_port outputs[] = {

@@ -1,8 +1,17 @@
+/** constant
+ *
+ * Holds a signal at the value of a parameter.
+ *
+ * Equations:
+ *   out[i] = value[i]
+ *
+ * Failure: An empty list is refused when the task is loaded.
+ */
 #include <flotilla/block.h>
 #include <string.h>
 
 struct constant {
-    struct fl_reals value;
+    struct fl_doubles value;
 };
 
 static const struct fl_parameter parameters[] = {

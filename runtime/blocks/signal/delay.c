@@ -1,5 +1,14 @@
-/* Blocks whose output is of the step before, so that they may close a loop. A task runs the reader of an FL_DELAYED
- * input before the block that writes it: what such an input carries is one step old. */
+/** delay
+ *
+ * Outputs the value that its input had a step before, for a signal of any type. The task runs the reader of a delayed
+ * input before the block that writes it, so this block may close a loop of wires.
+ *
+ * Equations:
+ *   out(k) = in(k − 1),  out(0) = initial
+ *
+ * Failure: A value of `initial` that the type cannot hold is refused when the task is loaded. Values that are not
+ * finite pass.
+ */
 #include "ports.h"
 
 #include <float.h>
@@ -14,9 +23,10 @@ struct delay {
 };
 
 static const struct fl_parameter delay_parameters[] = {
-    FL_PARAMETER(struct delay, type, .fallback = "double", .choices = TYPE_CHOICES, .summary = "of the signal"),
-    FL_PARAMETER(struct delay, width, .fallback = "1", .min = 1, .max = 65536, .summary = "elements of the signal"),
-    FL_PARAMETER(struct delay, initial, .fallback = "0", .summary = "each element of `out` in the first step"),
+    FL_PARAMETER(struct delay, type, .default_value = "double", .choices = TYPE_CHOICES, .summary = "of the signal"),
+    FL_PARAMETER(struct delay, width, .default_value = "1", .min = 1, .max = 65536,
+                 .summary = "elements of the signal"),
+    FL_PARAMETER(struct delay, initial, .default_value = "0", .summary = "each element of `out` in the first step"),
 };
 
 /* The value as an element of that type; false where it does not fit. */
@@ -97,12 +107,24 @@ FL_BLOCK(delay) = {
     .step = step_delay,
 };
 
+/** integrator
+ *
+ * Integrates a signal over time by the forward Euler method. Its input is delayed by a step, so it may close a loop of
+ * wires.
+ *
+ * Equations:
+ *   out(k) = out(k − 1) + T·in(k − 1),  out(0) = initial;  T: time since the step before, in s
+ *   while reset is 1: out = initial
+ *
+ * Failure: While the input, or the sum, is not finite, `out` keeps its value.
+ */
 struct integrator {
     double initial;
 };
 
 static const struct fl_parameter integrator_parameters[] = {
-    FL_PARAMETER(struct integrator, initial, .fallback = "0", .summary = "out in the first step and after a reset"),
+    FL_PARAMETER(struct integrator, initial, .default_value = "0",
+                 .summary = "out in the first step and after a reset"),
 };
 
 static const struct fl_port integrator_inputs[] = {

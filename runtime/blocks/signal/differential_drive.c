@@ -1,4 +1,14 @@
-/* Two driven wheels on one axle: from motion to wheels, and from wheels to motion and pose. */
+/** differential-drive
+ *
+ * Turns the commanded motion of a robot into the speeds of its two driven wheels on one axle.
+ *
+ * Equations:
+ *   left  = s·(v − omega·track/2)/radius
+ *   right = s·(v + omega·track/2)/radius
+ *   s = fastest/max(|left|, |right|) where a wheel would be faster than `fastest`, otherwise 1
+ *
+ * Failure: When a command is not finite both wheels get 0, and `limited` is 1.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 
@@ -12,7 +22,7 @@ struct drive {
 static const struct fl_parameter drive_parameters[] = {
     FL_PARAMETER(struct drive, radius, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "of the wheels"),
     FL_PARAMETER(struct drive, track, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "from wheel to wheel"),
-    FL_PARAMETER(struct drive, fastest, .fallback = "0", .max = INFINITY, .unit = "rad/s",
+    FL_PARAMETER(struct drive, fastest, .default_value = "0", .max = INFINITY, .unit = "rad/s",
                  .summary = "of a wheel: faster commands are slowed on both, so that the curve stays; 0: no limit"),
 };
 
@@ -56,6 +66,18 @@ FL_BLOCK(differential_drive) = {
     .step = step_drive,
 };
 
+/** differential-odometry
+ *
+ * Computes motion and pose of a robot from the speeds of its two driven wheels on one axle. It is exact while these
+ * speeds are constant between two steps.
+ *
+ * Equations:
+ *   v = radius·(right + left)/2,  omega = radius·(right − left)/track
+ *   a = omega·T/2,  c = v·T·sin(a)/a;  T: time since the step before, in s
+ *   x += c·cos(heading + a),  y += c·sin(heading + a),  heading += omega·T
+ *
+ * Failure: While a wheel's speed is not finite, `v` and `omega` are 0 and the pose stays.
+ */
 struct odometry {
     double radius, track, x, y, heading;
 };
@@ -66,9 +88,9 @@ enum { V, OMEGA, X, Y, HEADING };
 static const struct fl_parameter odometry_parameters[] = {
     FL_PARAMETER(struct odometry, radius, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "of the wheels"),
     FL_PARAMETER(struct odometry, track, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "from wheel to wheel"),
-    FL_PARAMETER(struct odometry, x, .fallback = "0", .unit = "m", .summary = "at time zero and after a reset"),
-    FL_PARAMETER(struct odometry, y, .fallback = "0", .unit = "m", .summary = "at time zero and after a reset"),
-    FL_PARAMETER(struct odometry, heading, .fallback = "0", .unit = "rad",
+    FL_PARAMETER(struct odometry, x, .default_value = "0", .unit = "m", .summary = "at time zero and after a reset"),
+    FL_PARAMETER(struct odometry, y, .default_value = "0", .unit = "m", .summary = "at time zero and after a reset"),
+    FL_PARAMETER(struct odometry, heading, .default_value = "0", .unit = "rad",
                  .summary = "at time zero and after a reset; from x to y"),
 };
 

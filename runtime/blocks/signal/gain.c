@@ -1,3 +1,12 @@
+/** gain
+ *
+ * Multiplies a signal by a constant.
+ *
+ * Equations:
+ *   out = factor·in
+ *
+ * Failure: Cannot fail. An input that is not finite gives an output that is not.
+ */
 #include <flotilla/block.h>
 
 struct gain {
@@ -5,7 +14,7 @@ struct gain {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct gain, factor, .flags = FL_TUNABLE, .fallback = "1",
+    FL_PARAMETER(struct gain, factor, .flags = FL_TUNABLE, .default_value = "1",
                  .summary = "what the input is multiplied by"),
 };
 

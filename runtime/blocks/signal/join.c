@@ -1,3 +1,12 @@
+/** join
+ *
+ * Makes one wide signal of several of the same type.
+ *
+ * Equations:
+ *   out[i] = in_i
+ *
+ * Failure: Cannot fail. Values that are not finite pass.
+ */
 #include "ports.h"
 
 #include <string.h>
@@ -8,8 +17,8 @@ struct join {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct join, type, .fallback = "double", .choices = TYPE_CHOICES, .summary = "of the signals"),
-    FL_PARAMETER(struct join, inputs, .fallback = "2", .min = 1, .max = 64, .summary = "how many"),
+    FL_PARAMETER(struct join, type, .default_value = "double", .choices = TYPE_CHOICES, .summary = "of the signals"),
+    FL_PARAMETER(struct join, inputs, .default_value = "2", .min = 1, .max = 64, .summary = "how many"),
 };
 
 static int configure(struct fl_block *block)

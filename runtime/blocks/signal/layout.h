@@ -1,19 +1,19 @@
-/* Signals of mixed types as bytes: what pack, unpack and recorder have in common. */
+/* Signals of mixed types as bytes, for pack, unpack and recorder. */
 #ifndef FLOTILLA_SIGNAL_LAYOUT_H
 #define FLOTILLA_SIGNAL_LAYOUT_H
 
 #include <flotilla/block.h>
 
 #define LAYOUT_MEMBERS                                                                                                 \
-    struct fl_texts types;                                                                                             \
-    struct fl_reals widths;                                                                                            \
-    struct fl_texts names
+    struct fl_strings types;                                                                                           \
+    struct fl_doubles widths;                                                                                          \
+    struct fl_strings names
 
 #define LAYOUT_PARAMETERS(type)                                                                                        \
     FL_PARAMETER(type, types, .summary = "of each signal: boolean, int8 to uint64, single, double"),                   \
-        FL_PARAMETER(type, widths, .fallback = "", .min = 1, .max = 65536,                                             \
+        FL_PARAMETER(type, widths, .default_value = "", .min = 1, .max = 65536,                                        \
                      .summary = "elements of each signal; without the list all have one"),                             \
-        FL_PARAMETER(type, names, .fallback = "", .summary = "of the ports, one for each signal")
+        FL_PARAMETER(type, names, .default_value = "", .summary = "of the ports, one for each signal")
 
 struct layout_field {
     const char *name;
@@ -30,15 +30,15 @@ struct layout {
 
 /* The parameters, as members of any block. */
 struct layout_parameters {
-    struct fl_texts types;
-    struct fl_reals widths;
-    struct fl_texts names;
+    struct fl_strings types;
+    struct fl_doubles widths;
+    struct fl_strings names;
 };
 
 #define LAYOUT(parameters) ((struct layout_parameters){(parameters)->types, (parameters)->widths, (parameters)->names})
 
-/* Lay out what the parameters list, each signal at the next multiple of `alignment`, the first at `start`, itself such
- * a multiple. Signals without a name are called `stem` and their number. */
+/* Lay out the signals that the parameters list, each at the next multiple of `alignment`. The first one is at `start`,
+ * a multiple of it, too. Signals without a name are named by `stem` and their number. */
 int layout_make(struct fl_block *block, struct layout_parameters parameters, const char *stem, size_t start,
                 size_t alignment, struct layout *layout);
 
@@ -49,7 +49,7 @@ bool layout_is_name(const char *text);
 int layout_add_ports(struct fl_block *block, const struct layout *layout,
                      int (*add)(struct fl_block *block, struct fl_port port), const char *summary);
 
-/* Elements of a signal, tight, to bytes and back. Booleans become 0 or 1. */
+/* Copy the elements of a signal, without gaps, to bytes and back. Booleans become 0 or 1. */
 void layout_put(enum fl_type type, uint32_t width, const void *signal, bool big_endian, uint8_t *bytes);
 void layout_get(enum fl_type type, uint32_t width, const uint8_t *bytes, bool big_endian, void *signal);
 

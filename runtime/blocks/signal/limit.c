@@ -1,3 +1,15 @@
+/** limit
+ *
+ * Keeps a signal within a range, and its change below a rate.
+ *
+ * Equations:
+ *   c = rate·T, unlimited for a rate of 0;  T: time since the step before, in s
+ *   out(k) = min(max(clamp(in, out(k − 1) − c, out(k − 1) + c), min), max),  out(−1) = initial
+ *   limited = (out ≠ in)
+ *
+ * Failure: While the input is not a number, `out` keeps its value and `limited` is 1. A `min` above `max` is refused
+ * when the task is loaded.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 
@@ -8,9 +20,9 @@ struct limit {
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct limit, min, .flags = FL_TUNABLE, .summary = "least output"),
     FL_PARAMETER(struct limit, max, .flags = FL_TUNABLE, .summary = "greatest output"),
-    FL_PARAMETER(struct limit, rate, .flags = FL_TUNABLE, .fallback = "0", .max = INFINITY, .unit = "1/s",
+    FL_PARAMETER(struct limit, rate, .flags = FL_TUNABLE, .default_value = "0", .max = INFINITY, .unit = "1/s",
                  .summary = "fastest change of the output, either way; 0: any"),
-    FL_PARAMETER(struct limit, initial, .fallback = "0",
+    FL_PARAMETER(struct limit, initial, .default_value = "0",
                  .summary = "output at time zero, from where the first change is limited"),
 };
 
@@ -46,7 +58,7 @@ static int step(struct fl_block *block)
     const struct limit *limit = block->parameters;
     double in = FL_IN(block, 0, double), before = FL_OUT(block, 0, double);
     double change = limit->rate > 0 ? limit->rate * 1e-9 * (double)block->interval_ns : INFINITY;
-    /* The range wins over the rate: it may have been tuned to end below where the output is. */
+    /* The range has precedence over the rate: tuning may have moved a limit past the output. */
     double out = isnan(in) ? before : clamped(limit, fmin(fmax(in, before - change), before + change));
     FL_OUT(block, 0, double) = out;
     FL_OUT(block, 1, bool) = !(out == in);

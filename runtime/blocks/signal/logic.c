@@ -1,4 +1,13 @@
-/* For flags: combine them, and let one choose between two signals. */
+/** logic
+ *
+ * Combines flags.
+ *
+ * Equations:
+ *   n: how many of the N inputs are not 0
+ *   and: n = N;  or: n > 0;  xor: n is odd;  not: n = 0
+ *
+ * Failure: Cannot fail.
+ */
 #include "ports.h"
 
 #include <inttypes.h>
@@ -11,9 +20,9 @@ struct logic {
 };
 
 static const struct fl_parameter logic_parameters[] = {
-    FL_PARAMETER(struct logic, operation, .fallback = "and", .choices = "and|or|xor|not",
+    FL_PARAMETER(struct logic, operation, .default_value = "and", .choices = "and|or|xor|not",
                  .summary = "how; not: true when none of the inputs is"),
-    FL_PARAMETER(struct logic, inputs, .fallback = "2", .min = 1, .max = 32, .summary = "how many"),
+    FL_PARAMETER(struct logic, inputs, .default_value = "2", .min = 1, .max = 32, .summary = "how many"),
 };
 
 static const struct fl_port logic_outputs[] = {
@@ -56,6 +65,15 @@ FL_BLOCK(logic) = {
     .step = step_logic,
 };
 
+/** select
+ *
+ * Lets a flag choose between two signals. An input without a wire is 0, so it also switches one signal on and off.
+ *
+ * Equations:
+ *   out = then, while condition is not 0; otherwise out = otherwise
+ *
+ * Failure: Cannot fail. Values that are not finite pass.
+ */
 static const struct fl_port select_inputs[] = {
     {.name = "condition", .type = FL_BOOLEAN, .width = 1, .summary = "which"},
     {.name = "then", .type = FL_DOUBLE, .width = 1, .flags = FL_OPTIONAL, .summary = "out while condition is true"},

@@ -1,3 +1,13 @@
+/** low-pass
+ *
+ * Smooths a signal by a first-order low-pass filter. It is exact for an input that is constant between two steps.
+ *
+ * Equations:
+ *   out(k) = in + (out(k − 1) − in)·exp(−T/time_constant);  T: time since the step before, in s
+ *   out = in for the first finite value, and always for a time constant of 0
+ *
+ * Failure: While the input is not finite, `out` keeps its value.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 
@@ -12,7 +22,7 @@ struct state {
 
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct low_pass, time_constant, .flags = FL_TUNABLE, .max = INFINITY, .unit = "s",
-                 .summary = "after it a step of the input has come through by 63 %; 0: no filter"),
+                 .summary = "time after which the output has followed 63 % of a step; 0: no filter"),
 };
 
 static const struct fl_port inputs[] = {{.name = "in", .type = FL_DOUBLE, .width = 1, .summary = "any signal"}};

@@ -1,4 +1,13 @@
-/* Signals to a vector of bytes and back, as UDP carries it. */
+/** pack
+ *
+ * Packs signals of several types into bytes, as UDP or CAN carries them.
+ *
+ * Equations:
+ *   begin(0) = 0,  begin(i) = begin(i − 1) + bytes of signal i − 1, rounded up to a multiple of `alignment`
+ *   width of out = end of the last signal; bytes of gaps are 0
+ *
+ * Failure: Cannot fail in a step. More than 65507 bytes are refused when the task is loaded.
+ */
 #include "layout.h"
 
 #include <string.h>
@@ -9,9 +18,9 @@ static const char source[] =
 enum { LARGEST = 65507 }; /* of a UDP datagram over IPv4 */
 
 #define FORMAT_PARAMETERS(type)                                                                                        \
-    FL_PARAMETER(type, byte_order, .fallback = "little", .choices = "little|big",                                      \
+    FL_PARAMETER(type, byte_order, .default_value = "little", .choices = "little|big",                                 \
                  .summary = "little: as an x86 sends; big: the network's"),                                            \
-        FL_PARAMETER(type, alignment, .fallback = "1", .choices = "1|2|4|8", .unit = "byte",                           \
+        FL_PARAMETER(type, alignment, .default_value = "1", .choices = "1|2|4|8", .unit = "byte",                      \
                      .summary = "each signal begins at a multiple of it; 1: no gaps")
 
 struct pack {
@@ -78,6 +87,16 @@ FL_BLOCK(pack) = {
     .step = step_pack,
 };
 
+/** unpack
+ *
+ * Unpacks bytes into signals of several types; they lie as `pack` lays them.
+ *
+ * Equations:
+ *   begin(0) = 0,  begin(i) = begin(i − 1) + bytes of signal i − 1, rounded up to a multiple of `alignment`
+ *
+ * Failure: With `check_length`, an input of another length gives flag 0 and the values stay; without it the flag is
+ * always 1. More than 65507 bytes, or a `size` below what the signals need, are refused when the task is loaded.
+ */
 struct unpack {
     LAYOUT_MEMBERS;
     int byte_order, alignment;
@@ -95,9 +114,9 @@ struct unpack_state {
 static const struct fl_parameter unpack_parameters[] = {
     LAYOUT_PARAMETERS(struct unpack),
     FORMAT_PARAMETERS(struct unpack),
-    FL_PARAMETER(struct unpack, size, .fallback = "0", .max = LARGEST, .unit = "byte",
+    FL_PARAMETER(struct unpack, size, .default_value = "0", .max = LARGEST, .unit = "byte",
                  .summary = "width of `in` where that is more than the signals need; 0: as they need"),
-    FL_PARAMETER(struct unpack, check_length, .fallback = "false",
+    FL_PARAMETER(struct unpack, check_length, .default_value = "false",
                  .summary = "have an input `length`: bytes that are good in `in`, which must be as the signals need"),
 };
 

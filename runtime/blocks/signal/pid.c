@@ -1,3 +1,21 @@
+/** pid
+ *
+ * A PID controller in parallel form, with limited output. The derivative is that of the measurement, so a step of the
+ * set point gives no kick.
+ *
+ * Equations:
+ *   T: time since the step before, in s
+ *   e = set_point − measurement, the short way round where `turn` is set
+ *   D = (filter·D + measurement − measurement before)/(filter + T)
+ *   u = kp·e + I − kd·D + feed_forward,  out = min(max(u, min), max)
+ *   I += ki·T·e, with anti-windup:
+ *     clamping          not while u is beyond a limit and e would drive it further
+ *     back-calculation  I += T/max(tracking, T)·(out − u) as well
+ *   while reset is 1: I = 0, D = 0, out = 0 within the limits
+ *
+ * Failure: In a step with an input that is not finite, `out` is 0 within the limits, `saturated` is 0, the integral
+ * stays, and the derivative begins again. A `min` above `max` is refused when the task is loaded.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 
@@ -10,8 +28,7 @@ struct pid {
     int anti_windup;
 };
 
-/* The integral is kept with its gain and the derivative without, so that neither tuning ki nor kd makes a jump of what
- * has been gathered. */
+/* The integral is stored multiplied by its gain and the derivative without, so that tuning ki or kd causes no jump. */
 struct state {
     double integral;    /* part of the output */
     double derivative;  /* of the measurement, filtered */
@@ -21,41 +38,41 @@ struct state {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct pid, kp, .flags = FL_TUNABLE, .fallback = "0", .summary = "gain of the error"),
-    FL_PARAMETER(struct pid, ki, .flags = FL_TUNABLE, .fallback = "0", .unit = "1/s",
+    FL_PARAMETER(struct pid, kp, .flags = FL_TUNABLE, .default_value = "0", .summary = "gain of the error"),
+    FL_PARAMETER(struct pid, ki, .flags = FL_TUNABLE, .default_value = "0", .unit = "1/s",
                  .summary = "gain of the error's integral"),
-    FL_PARAMETER(struct pid, kd, .flags = FL_TUNABLE, .fallback = "0", .unit = "s",
+    FL_PARAMETER(struct pid, kd, .flags = FL_TUNABLE, .default_value = "0", .unit = "s",
                  .summary = "gain of the measurement's derivative, which is subtracted"),
-    FL_PARAMETER(struct pid, filter, .flags = FL_TUNABLE, .fallback = "0", .max = INFINITY, .unit = "s",
+    FL_PARAMETER(struct pid, filter, .flags = FL_TUNABLE, .default_value = "0", .max = INFINITY, .unit = "s",
                  .summary = "time constant of the derivative's low-pass filter; 0: none"),
     FL_PARAMETER(struct pid, min, .flags = FL_TUNABLE, .summary = "least output"),
     FL_PARAMETER(struct pid, max, .flags = FL_TUNABLE, .summary = "greatest output"),
-    FL_PARAMETER(struct pid, anti_windup, .fallback = "clamping", .choices = "clamping|back-calculation|none",
+    FL_PARAMETER(struct pid, anti_windup, .default_value = "clamping", .choices = "clamping|back-calculation|none",
                  .summary = "clamping: the integral waits while the output is limited and the error would drive it "
                             "further; back-calculation: it is led back within `tracking`"),
-    FL_PARAMETER(struct pid, tracking, .fallback = "1", .min = 1e-6, .max = INFINITY, .unit = "s",
+    FL_PARAMETER(struct pid, tracking, .default_value = "1", .min = 1e-6, .max = INFINITY, .unit = "s",
                  .summary = "time constant of back-calculation"),
-    FL_PARAMETER(struct pid, turn, .fallback = "0", .max = INFINITY,
+    FL_PARAMETER(struct pid, turn, .default_value = "0", .max = INFINITY,
                  .summary = "for an angle: its full turn (360, 6.283185307179586), so that the error is the short way "
                             "round; 0: no angle"),
 };
 
 static const struct fl_port inputs[] = {
-    {.name = "set_point", .type = FL_DOUBLE, .width = 1, .summary = "what the measurement shall be"},
+    {.name = "set_point", .type = FL_DOUBLE, .width = 1, .summary = "desired value of the measurement"},
     {.name = "measurement", .type = FL_DOUBLE, .width = 1, .summary = "what it is"},
     {.name = "feed_forward", .type = FL_DOUBLE, .width = 1, .flags = FL_OPTIONAL, .summary = "added to the output"},
     {.name = "reset",
      .type = FL_BOOLEAN,
      .width = 1,
      .flags = FL_OPTIONAL,
-     .summary = "1: out is zero, limited, and the integral and the derivative begin anew"},
+     .summary = "1: out is zero within the limits, and integral and derivative restart"},
 };
 
 static const struct fl_port outputs[] = {
     {.name = "out",
      .type = FL_DOUBLE,
      .width = 1,
-     .summary = "the command; zero, limited, in a step whose inputs are not all finite"},
+     .summary = "the command; zero within the limits in a step with an input that is not finite"},
     {.name = "saturated", .type = FL_BOOLEAN, .width = 1, .summary = "1: out is at min or max"},
 };
 
@@ -109,7 +126,7 @@ static void integrate(const struct pid *pid, struct state *state, double h, doub
         state->integral += growth;
 }
 
-/* Two steps that a trigger brought close to each other would divide by next to nothing: the second is left out. */
+/* Two steps that a trigger brought close together would divide by almost zero, so the second one is left out. */
 static void differentiate(const struct fl_block *block, double measurement)
 {
     const struct pid *pid = block->parameters;
@@ -135,7 +152,7 @@ static int step(struct fl_block *block)
     differentiate(block, measurement);
     double wanted =
         pid->kp * error + state->integral - pid->kd * state->derivative + FL_IN(block, FEED_FORWARD, double);
-    state->begun = isfinite(wanted) && isfinite(state->derivative); /* otherwise the derivative begins anew */
+    state->begun = isfinite(wanted) && isfinite(state->derivative); /* otherwise the derivative starts again */
     if (!state->begun) {
         rest(block);
         return FL_OK;

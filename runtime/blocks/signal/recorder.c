@@ -1,11 +1,14 @@
-/* Signals to files, as records of a fixed size.
+/** recorder
+ *
+ * Records signals in files, as records of a fixed size. The step puts a record into a buffer; a thread of ordinary
+ * priority writes it. flotilla/station/recording.py reads the files.
  *
  * A file NAME-000001.rec, all little-endian, is a header and then records until its end:
  *
  *   "FLOTREC1"        8 bytes
  *   header, record    uint32 each: bytes of the header, these 16 included, and of a record
- *   schema            JSON, padded with spaces: name, period_ns, wall_less_monotonic_ns (of when the file was begun),
- * and fields, each with name, type, width, offset in the record
+ *   schema            JSON, padded with spaces: name, period_ns, wall_less_monotonic_ns (when the file was begun),
+ *                     and fields, each with name, type, width, offset in the record
  *
  *   time_ns           int64: when the step was due, CLOCK_MONOTONIC
  *   step              uint64
@@ -13,10 +16,13 @@
  *   the signals, without gaps
  *   check             uint32: CRC-32 (IEEE 802.3, as zlib's) of all before it
  *
- * Whoever is killed leaves whole records, for they are written by whole ones; where power went, the check tells which
- * are good, and half a record at the end is none. The reader is runtime/station/recording.py. */
+ * Failure: No step waits for the disk. A record for which the buffer has no room is lost, and counted in `lost`. When
+ * the disk is full or fails, `recording` becomes 0, the journal says why, and the task goes on. A directory that is
+ * not there fails the start. Records are written whole, so a killed writer leaves none partial; after a loss of power
+ * the check tells which are good.
+ */
 #define _GNU_SOURCE
-#include "drivers/wall_clock.h"
+#include "core/wall_clock.h"
 #include "layout.h"
 
 #include <dirent.h>
@@ -35,7 +41,7 @@ enum { RECORDING, RECORDED, LOST };
 enum { TIME_AT = 0, STEP_AT = 8, LOST_AT = 16, SIGNALS_AT = 20, CHECK_BYTES = 4, PREFIX = 16 };
 
 enum {
-    WAKE_MS = 50, /* by the clock: to wake the writer at every step would cost the step a system call */
+    WAKE_MS = 50, /* period of the writer: waking it in every step would cost the step a system call */
     BATCH_BYTES = 64 * 1024,
     MOST_FILES = 1000,
     MOST_BYTES = 1 << 20,  /* of a record */
@@ -44,10 +50,9 @@ enum {
     FILE_BYTES = NAME_BYTES + 16,
 };
 
-/* Two seconds of buffer by default: a card may be busy with a write for half a second (SD Physical Layer Specification,
- * 4.6.2.2), a sync writes more than once, and at its ordinary priority the writer has its turn after all that is
- * urgent.
- */
+/* The default buffer is two seconds: a card may be busy with a write for half a second (SD Physical Layer
+ * Specification, 4.6.2.2), a sync writes more than once, and the writer, at ordinary priority, runs after all that is
+ * urgent. */
 struct recorder {
     LAYOUT_MEMBERS;
     const char *directory, *name;
@@ -86,19 +91,20 @@ struct state {
 static const struct fl_parameter parameters[] = {
     LAYOUT_PARAMETERS(struct recorder),
     FL_PARAMETER(struct recorder, directory, .summary = "where the files go; it must be there"),
-    FL_PARAMETER(struct recorder, name, .fallback = "", .summary = "what the files begin with; without: the block's"),
-    FL_PARAMETER(struct recorder, file_bytes, .fallback = "16777216", .min = 4096, .max = 2147483647, .unit = "byte",
-                 .summary = "of a file, then the next is begun"),
-    FL_PARAMETER(struct recorder, files, .fallback = "8", .min = 1, .max = MOST_FILES,
+    FL_PARAMETER(struct recorder, name, .default_value = "",
+                 .summary = "what the files begin with; without: the block's"),
+    FL_PARAMETER(struct recorder, file_bytes, .default_value = "16777216", .min = 4096, .max = 2147483647,
+                 .unit = "byte", .summary = "of a file, then the next is begun"),
+    FL_PARAMETER(struct recorder, files, .default_value = "8", .min = 1, .max = MOST_FILES,
                  .summary = "that are kept, those of earlier runs included: the oldest goes when a new one is begun"),
-    FL_PARAMETER(struct recorder, buffer, .fallback = "2", .min = 0.2, .max = 600, .unit = "s",
+    FL_PARAMETER(struct recorder, buffer, .default_value = "2", .min = 0.2, .max = 600, .unit = "s",
                  .summary = "of records that wait in memory while the disk or the processor is busy"),
-    FL_PARAMETER(struct recorder, sync, .fallback = "5", .min = 0, .max = 3600, .unit = "s",
-                 .summary = "how much is lost at most when power goes; 0: as much as the system holds back"),
+    FL_PARAMETER(struct recorder, sync, .default_value = "5", .min = 0, .max = 3600, .unit = "s",
+                 .summary = "how much is lost at most when power goes; 0: as much as the system buffers"),
 };
 
 static const struct fl_port outputs[] = {
-    {.name = "recording", .type = FL_BOOLEAN, .width = 1, .summary = "0: given up, as the disk is full or at fault"},
+    {.name = "recording", .type = FL_BOOLEAN, .width = 1, .summary = "0: stopped, because the disk is full or faulty"},
     {.name = "recorded", .type = FL_UINT32, .width = 1, .summary = "records written so far"},
     {.name = "lost", .type = FL_UINT32, .width = 1, .summary = "records lost so far"},
 };
@@ -276,7 +282,7 @@ static void close_file(struct writer *writer)
     writer->fd = -1;
 }
 
-/* For good: a disk that is full now and then would leave gaps that nobody expects. */
+/* Stop for good: a disk that is full now and then would leave unexpected gaps. */
 static void give_up(struct state *state, const char *what)
 {
     const struct recorder *recorder = state->block->parameters;
@@ -285,7 +291,7 @@ static void give_up(struct state *state, const char *what)
     close_file(&state->writer);
 }
 
-/* How many bytes of it were written. */
+/* Write the bytes; returns how many were written. */
 static size_t write_all(int fd, const void *bytes, size_t count)
 {
     size_t done = 0;
@@ -440,7 +446,7 @@ static int start(struct fl_block *block)
     if (find_files(block, state) != FL_OK)
         return FL_FAILED;
     atomic_store(&state->recording, true);
-    /* The kernel's disk work in a write or a sync takes milliseconds: nothing of the robot may wait for it. */
+    /* A write or a sync keeps the kernel busy for milliseconds, which must not delay the robot. */
     state->driver = fl_driver_start_ordinary(block, run, state);
     return state->driver ? FL_OK : FL_FAILED;
 }
@@ -477,7 +483,7 @@ FL_BLOCK(recorder) = {
     .abi = FL_ABI,
     .name = "recorder",
     .summary = "records signals to files: an input in0, in1, ... (or named) for each of types, every step",
-    .source = "this project's own format, told in recorder.c; check: CRC-32 of IEEE 802.3",
+    .source = "this project's own format, described in recorder.c; check: CRC-32 of IEEE 802.3",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct recorder),

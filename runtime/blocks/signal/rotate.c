@@ -1,3 +1,14 @@
+/** rotate
+ *
+ * Gives a vector of the plane in axes that are turned by an angle: a command in the world as one in the robot's axes,
+ * or back.
+ *
+ * Equations:
+ *   into:    x' =  cos(angle)·x + sin(angle)·y,  y' = −sin(angle)·x + cos(angle)·y
+ *   out-of:  x' =  cos(angle)·x − sin(angle)·y,  y' =  sin(angle)·x + cos(angle)·y
+ *
+ * Failure: Cannot fail. An input that is not finite gives outputs that are not.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 
@@ -10,9 +21,9 @@ struct rotate {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct rotate, direction, .fallback = "into", .choices = "into|out-of",
+    FL_PARAMETER(struct rotate, direction, .default_value = "into", .choices = "into|out-of",
                  .summary = "into: from fixed axes into those that are turned by `angle`, as a robot's; out-of: back"),
-    FL_PARAMETER(struct rotate, unit, .fallback = "rad", .choices = "rad|deg", .summary = "of `angle`"),
+    FL_PARAMETER(struct rotate, unit, .default_value = "rad", .choices = "rad|deg", .summary = "of `angle`"),
 };
 
 static const struct fl_port inputs[] = {

@@ -1,3 +1,14 @@
+/** schmitt-trigger
+ *
+ * Switches with hysteresis: on at one value, off below a lesser one.
+ *
+ * Equations:
+ *   sign = 1 once in ≥ on, until in < off
+ *   symmetric: also sign = −1 once −in ≥ on, until −in < off
+ *   on = (sign ≠ 0)
+ *
+ * Failure: While the input is not a number, it is off. An `off` above `on` is refused when the task is loaded.
+ */
 #include <flotilla/block.h>
 
 struct schmitt_trigger {
@@ -12,7 +23,7 @@ struct state {
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct schmitt_trigger, on, .flags = FL_TUNABLE, .summary = "goes on at this value and above"),
     FL_PARAMETER(struct schmitt_trigger, off, .flags = FL_TUNABLE, .summary = "goes off below this value"),
-    FL_PARAMETER(struct schmitt_trigger, symmetric, .fallback = "false",
+    FL_PARAMETER(struct schmitt_trigger, symmetric, .default_value = "false",
                  .summary = "the same below zero, mirrored: a dead band around zero, for an error with a sign"),
 };
 

@@ -1,3 +1,13 @@
+/** sum
+ *
+ * Adds and subtracts signals.
+ *
+ * Equations:
+ *   out = ± in0 ± in1 …, by `signs`
+ *
+ * Failure: Cannot fail. An input that is not finite gives an output that is not. A text with anything but + and - is
+ * refused when the task is loaded.
+ */
 #include "ports.h"
 
 #include <string.h>
@@ -9,7 +19,7 @@ struct sum {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct sum, signs, .fallback = "++",
+    FL_PARAMETER(struct sum, signs, .default_value = "++",
                  .summary = "one + or - for each input: \"+-\" gives out = in0 - in1"),
 };
 

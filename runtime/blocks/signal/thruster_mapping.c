@@ -1,9 +1,21 @@
-/* Force and torque to the on-times of on/off thrusters, with the least on-time in total.
+/** thruster-mapping
  *
- * Thrusters only push, so what is wanted is the least sum of duties u >= 0 with A u = b: a linear programme. Its
- * optimum lies at a basis, a choice of three thrusters that alone make b. All bases are inverted at start; a step tries
- * each, 9 multiplications apiece, so that its time is bounded and the same for every command: 56 bases of eight
- * thrusters. */
+ * Maps force and torque to the on-times of on/off thrusters, with the least on-time in total.
+ *
+ * Thrusters only push, so the duties solve a linear programme. Its optimum lies at a basis, a choice of three
+ * thrusters that alone make the command. All bases are inverted at start. A step tries each, with 9 multiplications,
+ * so its time is bounded and the same for every command: 56 bases of eight thrusters.
+ *
+ * Equations:
+ *   least Σ u_i with Σ u_i·a_i = (force_x, force_y, torque) and u_i ≥ 0
+ *   a_i = force_i·(d_x, d_y, p_x·d_y − p_y·d_x), with position p and unit direction d of thruster i
+ *   beyond the thrusters' strength, max(u_i) > 1: all u_i are divided by max(u_i), and saturated = 1
+ *   on_time_i = u_i·steps, rounded to whole steps; below `minimum` it becomes that or, below its half, 0
+ *   achieved = Σ a_i·on_time_i/control period
+ *
+ * Failure: A command that is not finite, or beyond 1e30, opens no valve and gives saturated 1 for its control period.
+ * Thrusters that cannot make force and torque in every direction are refused when the task is loaded.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 #include <string.h>
@@ -18,7 +30,7 @@ static const char *const axis_names[] = {"force_x", "force_y", "torque"};
 static const double tolerance = 1e-9;
 
 struct thruster_mapping {
-    struct fl_reals positions, directions, force;
+    struct fl_doubles positions, directions, force;
     int64_t steps;
     double minimum;
 };
@@ -49,9 +61,9 @@ static const struct fl_parameter parameters[] = {
                  .summary = "x and y of each thruster's push on the robot; the length does not matter"),
     FL_PARAMETER(struct thruster_mapping, force, .min = 1e-9, .max = 1e9, .unit = "N",
                  .summary = "of all thrusters, or of each"),
-    FL_PARAMETER(struct thruster_mapping, steps, .fallback = "1", .min = 1, .max = 1000000,
+    FL_PARAMETER(struct thruster_mapping, steps, .default_value = "1", .min = 1, .max = 1000000,
                  .summary = "of a control period: a command is taken at its beginning, and the pulses lie in it"),
-    FL_PARAMETER(struct thruster_mapping, minimum, .fallback = "0", .max = 3600, .unit = "s",
+    FL_PARAMETER(struct thruster_mapping, minimum, .default_value = "0", .max = 3600, .unit = "s",
                  .summary = "on-time that a valve needs: shorter ones become this or, below its half, nothing"),
 };
 
@@ -124,8 +136,8 @@ static void make_bases(struct mapping *mapping)
             }
 }
 
-/* Duties of all thrusters that make `wanted` with the least sum. Where none can without a duty above 1: those that can
- * the most of it, in its direction. False where it cannot be made at all. */
+/* Find the duties of all thrusters that make `wanted` with the least sum. If that needs a duty above 1, find those that
+ * make as much as possible in its direction. False if it cannot be made at all. */
 static bool allocate(const struct mapping *mapping, const double wanted[AXES], double duty[MOST], bool *saturated)
 {
     const struct basis *best = NULL;
@@ -136,7 +148,7 @@ static bool allocate(const struct mapping *mapping, const double wanted[AXES], d
                           dot(basis->inverse[2], wanted)};
         double most = fmax(fmax(u[0], u[1]), u[2]), least = fmin(fmin(u[0], u[1]), u[2]);
         double peak = fmax(most, 1), sum = u[0] + u[1] + u[2];
-        /* Equal but for rounding: the first stays, so that the choice does not flicker. */
+        /* Equal except for rounding: the first stays, so that the choice does not flicker. */
         bool better = peak < best_peak * (1 - tolerance) ||
                       (peak <= best_peak * (1 + tolerance) && sum < best_sum * (1 - tolerance));
         if (least < -tolerance * fmax(most, tolerance) || !better)
@@ -153,7 +165,8 @@ static bool allocate(const struct mapping *mapping, const double wanted[AXES], d
     return best != NULL;
 }
 
-/* The geometry, which must be able to push and turn in both directions of each axis: then it can everything. */
+/* Compute the geometry. The thrusters must be able to act in both directions of each axis; then they can make every
+ * command. */
 static int make_mapping(struct fl_block *block, struct mapping *mapping)
 {
     double duty[MOST];
@@ -236,7 +249,7 @@ static void begin_period(struct fl_block *block)
                                  FL_IN(block, TORQUE, double)};
     double duty[MOST] = {0}, *on_time = block->out[ON_TIME], *achieved = block->out[ACHIEVED];
     bool saturated = true;
-    /* The magnitude too: products of the largest numbers are not finite. */
+    /* Limit the magnitude, too: products of the largest numbers are not finite. */
     if (fabs(wanted[0]) + fabs(wanted[1]) + fabs(wanted[2]) < 1e30)
         allocate(&state->mapping, wanted, duty, &saturated);
     memset(achieved, 0, AXES * sizeof *achieved);

@@ -1,5 +1,17 @@
-/* Straight lines from way point to way point. Along each line the way s of 0 to 1 is a polynomial of the time t of 0 to
- * 1: t (linear), 3t² - 2t³ (cubic), 10t³ - 15t⁴ + 6t⁵ (quintic). The latter two rest at each way point. */
+/** trajectory
+ *
+ * Moves a set point along straight lines from way point to way point. It goes by the clock, so a step that was skipped
+ * does not delay it.
+ *
+ * Equations:
+ *   a, b: the points before and after; D: the time between them in s; t: the part of D that has passed, 0 to 1
+ *   linear s = t;  cubic s = 3t² − 2t³;  quintic s = 10t³ − 15t⁴ + 6t⁵; the latter two rest at each way point
+ *   position = a + s·(b − a),  velocity = s'·(b − a)/D,  acceleration = s''·(b − a)/D²
+ *   D by `times`, or |b − a|/speed
+ *
+ * Failure: Points, times and speed that do not fit each other are refused when the task is loaded. An `elapsed` that
+ * is not finite, negative, or beyond 1e9 s counts as 0. After the last point the position stays there, with `done` 1.
+ */
 #include <flotilla/block.h>
 #include <math.h>
 #include <string.h>
@@ -10,7 +22,7 @@ enum { POSITION, VELOCITY, ACCELERATION, DONE };
 enum { LONGEST_S = 1000000000 }; /* that a begin may lie back */
 
 struct trajectory {
-    struct fl_reals waypoints, times;
+    struct fl_doubles waypoints, times;
     int64_t dimensions;
     double speed;
     int interpolation;
@@ -27,13 +39,13 @@ struct state {
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct trajectory, waypoints,
                  .summary = "all coordinates of the first point, then of the second, ..."),
-    FL_PARAMETER(struct trajectory, dimensions, .fallback = "1", .min = 1, .max = 64,
+    FL_PARAMETER(struct trajectory, dimensions, .default_value = "1", .min = 1, .max = 64,
                  .summary = "coordinates of a point"),
-    FL_PARAMETER(struct trajectory, times, .fallback = "", .max = INFINITY, .unit = "s",
+    FL_PARAMETER(struct trajectory, times, .default_value = "", .max = INFINITY, .unit = "s",
                  .summary = "when each point is to be reached, increasing; or give `speed`"),
-    FL_PARAMETER(struct trajectory, speed, .fallback = "0", .max = INFINITY, .unit = "1/s",
+    FL_PARAMETER(struct trajectory, speed, .default_value = "0", .max = INFINITY, .unit = "1/s",
                  .summary = "mean speed along each line, in units of the coordinates; begins at once"),
-    FL_PARAMETER(struct trajectory, interpolation, .fallback = "linear", .choices = "linear|cubic|quintic",
+    FL_PARAMETER(struct trajectory, interpolation, .default_value = "linear", .choices = "linear|cubic|quintic",
                  .summary = "linear: constant speed, turning at once; cubic, quintic: resting at each point, reaching "
                             "1.5 and 1.875 times the mean speed; the quintic's acceleration has no jumps"),
 };

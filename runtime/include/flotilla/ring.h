@@ -1,15 +1,15 @@
-/* A lock-free queue of fixed-size records from one thread to another: one puts, one takes, neither waits. */
+/* A lock-free queue of fixed-size records from one thread to one other thread. Neither waits. */
 #ifndef FLOTILLA_RING_H
 #define FLOTILLA_RING_H
 
 #include <flotilla/block.h>
 
 struct fl_ring {
-    size_t record;  /* bytes of one */
+    size_t record;  /* bytes of a record */
     uint32_t count; /* a power of two */
     unsigned char *data;
     _Alignas(64) _Atomic uint32_t head; /* next to put; the producer's */
-    _Atomic uint32_t lost;              /* put while full */
+    _Atomic uint32_t lost;              /* records dropped because the ring was full */
     _Alignas(64) _Atomic uint32_t tail; /* next to take; the consumer's */
 };
 

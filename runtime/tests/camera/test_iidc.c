@@ -110,8 +110,8 @@ static void waits_for_its_camera(void **state)
     look(block);
     assert_int_equal(GET(block, "flag", uint8_t), 0);
     testbed_end(block);
-    assert_int_equal(said_times(&said, "no camera on the FireWire bus; trying on"), 1);
-    assert_int_equal(said_times(&said, "the camera is gone; trying on"), 1);
+    assert_int_equal(said_times(&said, "no camera on the FireWire bus; retrying"), 1);
+    assert_int_equal(said_times(&said, "the camera is gone; retrying"), 1);
     said_end(&said);
 }
 

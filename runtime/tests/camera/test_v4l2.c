@@ -329,9 +329,9 @@ static void says_what_is_wrong(void **state)
         bool absent, wrong_size;
         const char *said;
     } cases[] = {
-        {.absent = true, .said = "cannot open /dev/video-test: No such file or directory; trying on"},
-        {.able = 0, .said = "/dev/video-test is no camera: set device to"},
-        {.able = V4L2_CAP_META_CAPTURE | V4L2_CAP_STREAMING, .said = "/dev/video-test is no camera: set device to"},
+        {.absent = true, .said = "cannot open /dev/video-test: No such file or directory; retrying"},
+        {.able = 0, .said = "/dev/video-test is not a camera: set device to"},
+        {.able = V4L2_CAP_META_CAPTURE | V4L2_CAP_STREAMING, .said = "/dev/video-test is not a camera: set device to"},
         {.format = V4L2_PIX_FMT_MJPEG,
          .able = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING,
          .said = "/dev/video-test offers MJPG H264, of which none is read: take a camera with one of GREY NV12 "},

@@ -1,5 +1,5 @@
 /* The engine against a drive of few lines: what the engine sends, in which order, and what it makes of the answers.
- * tests/emulators/epos2.py is the complete drive, which the block is tested against. */
+ * lab/emulators/epos2.py is the complete drive, which the block is tested against. */
 #include "blocks/can/epos2.h"
 #include "testbed.h"
 
@@ -9,7 +9,7 @@
 enum { NODE = 5, PERIOD_MS = 10, CONTACT = 80 /* periods in which a drive is configured and enabled */ };
 #define MS INT64_C(1000000)
 
-/* --- a drive that does as it is told --- */
+/* --- a drive that executes its commands --- */
 
 struct stub {
     struct epos2 engine;
@@ -37,7 +37,7 @@ static const struct epos2_settings usual = {
     .rpm_per_rad_s = 10,
 };
 
-static void hear(struct stub *stub, uint32_t id, size_t length, const void *data)
+static void deliver(struct stub *stub, uint32_t id, size_t length, const void *data)
 {
     struct can_frame frame = {.can_id = id};
     frame.len = (uint8_t)length;
@@ -76,7 +76,7 @@ static void answer_sdo(struct stub *stub, const uint8_t *request)
         if (name == 0x606000)
             stub->mode = (int8_t)value;
     }
-    hear(stub, 0x580 + NODE, 8, answer);
+    deliver(stub, 0x580 + NODE, 8, answer);
 }
 
 static void obey(struct stub *stub, uint16_t word)
@@ -110,14 +110,14 @@ static void report(struct stub *stub)
     uint32_t p = (uint32_t)stub->counts, v = (uint32_t)stub->rpm;
     uint16_t i = (uint16_t)stub->ma;
     if (on(stub, 0x1801))
-        hear(stub, 0x280 + NODE, 3, (uint8_t[]){low, high, (uint8_t)stub->mode});
+        deliver(stub, 0x280 + NODE, 3, (uint8_t[]){low, high, (uint8_t)stub->mode});
     if (on(stub, 0x1802))
-        hear(stub, 0x380 + NODE, 6,
-             (uint8_t[]){low, high, (uint8_t)p, (uint8_t)(p >> 8), (uint8_t)(p >> 16), (uint8_t)(p >> 24)});
+        deliver(stub, 0x380 + NODE, 6,
+                (uint8_t[]){low, high, (uint8_t)p, (uint8_t)(p >> 8), (uint8_t)(p >> 16), (uint8_t)(p >> 24)});
     if (on(stub, 0x1803))
-        hear(stub, 0x480 + NODE, 8,
-             (uint8_t[]){low, high, (uint8_t)v, (uint8_t)(v >> 8), (uint8_t)(v >> 16), (uint8_t)(v >> 24), (uint8_t)i,
-                         (uint8_t)(i >> 8)});
+        deliver(stub, 0x480 + NODE, 8,
+                (uint8_t[]){low, high, (uint8_t)v, (uint8_t)(v >> 8), (uint8_t)(v >> 16), (uint8_t)(v >> 24),
+                            (uint8_t)i, (uint8_t)(i >> 8)});
 }
 
 static void take(struct stub *stub, const struct can_frame *frame)
@@ -126,7 +126,7 @@ static void take(struct stub *stub, const struct can_frame *frame)
         stub->operational = frame->data[0] == 1;
         if (frame->data[0] == 0x82) {
             stub->object_count = 0;
-            hear(stub, 0x700 + NODE, 1, "\x00");
+            deliver(stub, 0x700 + NODE, 1, "\x00");
         }
     } else if (frame->can_id == 0x600 + NODE) {
         answer_sdo(stub, frame->data);
@@ -138,7 +138,7 @@ static void take(struct stub *stub, const struct can_frame *frame)
     }
 }
 
-/* One period: the engine sends, the drive hears it and answers. */
+/* One period: the engine sends, the drive receives it and answers. */
 static void period(struct stub *stub)
 {
     stub->now_ns += PERIOD_MS * MS;
@@ -147,7 +147,7 @@ static void period(struct stub *stub)
     assert_true(stub->sent_count <= EPOS2_FRAMES);
     if (!stub->present)
         return;
-    hear(stub, 0x700 + NODE, 1, stub->operational ? "\x05" : "\x7F");
+    deliver(stub, 0x700 + NODE, 1, stub->operational ? "\x05" : "\x7F");
     for (size_t i = 0; i < stub->sent_count; i++)
         take(stub, &stub->sent[i]);
 }
@@ -372,7 +372,7 @@ static void a_silent_sdo_server_is_reset(void **state)
 static void faults(struct stub *stub)
 {
     stub->status = 0x0008;
-    hear(stub, 0x080 + NODE, 8, "\x10\x23\x03\x00\x00\x00\x00\x00"); /* over-current */
+    deliver(stub, 0x080 + NODE, 8, "\x10\x23\x03\x00\x00\x00\x00\x00"); /* over-current */
     periods(stub, 10);
     assert_false(epos2_enabled(&stub->engine));
     assert_int_equal(stub->engine.error_code, 0x2310);
@@ -497,7 +497,7 @@ static void is_silent(struct stub *stub)
 
 static void loses_its_power(struct stub *stub)
 {
-    hear(stub, 0x700 + NODE, 1, "\x00");
+    deliver(stub, 0x700 + NODE, 1, "\x00");
     assert_int_equal(stub->engine.phase, EPOS2_CONFIGURING);
     stub->operational = false;
     stub->status = 0x0040;
@@ -522,7 +522,7 @@ static void is_cut_off(struct stub *stub)
 static void has_a_fault(struct stub *stub)
 {
     stub->status = 0x0008;
-    hear(stub, 0x080 + NODE, 8, "\x30\x81\x11\x00\x00\x00\x00\x00"); /* it missed our heartbeats */
+    deliver(stub, 0x080 + NODE, 8, "\x30\x81\x11\x00\x00\x00\x00\x00"); /* it missed our heartbeats */
 }
 
 static void (*const failures[])(struct stub *stub) = {
@@ -662,7 +662,7 @@ static void sends_heartbeats(void **state)
     test_free(stub);
 }
 
-/* A drive that has not heard any would not miss them: the motor would run on for ever. */
+/* A drive that has not received any would not miss them: the motor would run on for ever. */
 static void a_heartbeat_comes_before_any_motion(void **state)
 {
     (void)state;
@@ -670,16 +670,16 @@ static void a_heartbeat_comes_before_any_motion(void **state)
     settings.heartbeat_ms = 10000;
     struct stub *stub = make(settings);
     stub->command.enable = true;
-    bool heard = false;
+    bool received = false;
     while (!stub->operational) {
         bool watches = object(stub, 0x101601);
         period(stub);
         for (size_t i = 0; i < stub->sent_count && !stub->engine.sdo_waiting; i++) {
-            heard = heard || (watches && stub->sent[i].can_id == 0x77F);
-            assert_true(stub->sent[i].can_id != 0 || stub->sent[i].data[0] != 1 || heard); /* NMT start */
+            received = received || (watches && stub->sent[i].can_id == 0x77F);
+            assert_true(stub->sent[i].can_id != 0 || stub->sent[i].data[0] != 1 || received); /* NMT start */
         }
     }
-    assert_true(heard);
+    assert_true(received);
     test_free(stub);
 }
 
@@ -732,7 +732,7 @@ static void disables_at_once(void **state)
     assert_memory_equal(out[1].data, "\0\0", 2);
     assert_int_equal(out[2].can_id, 0x605); /* an SDO */
     assert_memory_equal(out[2].data, "\x2B\x40\x60\0\0\0\0\0", 8);
-    assert_int_equal(epos2_farewell(&stub->engine, out), 4);
+    assert_int_equal(epos2_shutdown(&stub->engine, out), 4);
     assert_int_equal(out[0].can_id, 0x505);
     assert_int_equal(out[3].can_id, 0);
     assert_memory_equal(out[3].data, "\x82\x05", 2);
@@ -744,21 +744,21 @@ static void ignores_what_is_not_the_drives(void **state)
     (void)state;
     struct stub *stub = enabled(usual);
     uint32_t sequence = stub->engine.sequence;
-    hear(stub, 0x386, 6, "\x27\0\1\1\1\1");                /* another node */
-    hear(stub, 0x385 | CAN_EFF_FLAG, 6, "\x27\0\1\1\1\1"); /* another format */
-    hear(stub, 0x385 | CAN_RTR_FLAG, 6, "\x27\0\1\1\1\1"); /* a request */
-    hear(stub, 0x385, 5, "\x27\0\1\1\1");                  /* another length */
-    hear(stub, 0x485, 7, "\x27\0\1\1\1\1\1");
+    deliver(stub, 0x386, 6, "\x27\0\1\1\1\1");                /* another node */
+    deliver(stub, 0x385 | CAN_EFF_FLAG, 6, "\x27\0\1\1\1\1"); /* another format */
+    deliver(stub, 0x385 | CAN_RTR_FLAG, 6, "\x27\0\1\1\1\1"); /* a request */
+    deliver(stub, 0x385, 5, "\x27\0\1\1\1");                  /* another length */
+    deliver(stub, 0x485, 7, "\x27\0\1\1\1\1\1");
     assert_int_equal(stub->engine.sequence, sequence);
     assert_int_equal(stub->engine.counts, 0);
-    hear(stub, 0x485, 8, "\x27\0\1\1\1\1\1\1"); /* a velocity without its position is no set */
+    deliver(stub, 0x485, 8, "\x27\0\1\1\1\1\1\1"); /* a velocity without its position is no set */
     assert_int_equal(stub->engine.sequence, sequence);
     stub->engine.phase = EPOS2_CONFIGURING;
     stub->engine.sdo_waiting = true;
     stub->engine.write_next = 1;
-    hear(stub, 0x585, 8, "\x60\x40\x60\0\0\0\0\0"); /* the answer to another request */
+    deliver(stub, 0x585, 8, "\x60\x40\x60\0\0\0\0\0"); /* the answer to another request */
     assert_int_equal(stub->engine.write_next, 1);
-    hear(stub, 0x585, 8, "\x60\x60\x60\0\0\0\0\0");
+    deliver(stub, 0x585, 8, "\x60\x60\x60\0\0\0\0\0");
     assert_int_equal(stub->engine.write_next, 2);
     test_free(stub);
 }

@@ -33,7 +33,7 @@ static struct udp_can {
     size_t filter_count;
     can_err_mask_t reports;
     unsigned index; /* of the interface that it is bound to */
-    bool told;      /* that the interface is gone, or down: the kernel says it once */
+    bool reported;  /* that the interface is gone, or down: the kernel says it once */
 } udp_cans[UDP_CAN_SOCKETS];
 
 static void *udp_can_real(const char *name)
@@ -185,13 +185,13 @@ ssize_t recvmsg(int fd, struct msghdr *message, int flags)
         message->msg_controllen = room;
         ssize_t count =
             ((ssize_t (*)(int, struct msghdr *, int))(uintptr_t)udp_can_real("recvmsg"))(fd, message, flags);
-        if (error && count < 0 && !can->told) {
-            can->told = true;
+        if (error && count < 0 && !can->reported) {
+            can->reported = true;
             errno = error;
             return -1;
         }
         if (can && !error)
-            can->told = false;
+            can->reported = false;
         if (!can || count < 0 || (!error && udp_can_passes(can, message->msg_iov[0].iov_base)))
             return count;
     }

@@ -1,4 +1,4 @@
-/* Why a device is not good: each reason is told once, and anew after the device was good for a while. */
+/* Why a device is not good: each reason is logged once, and anew after the device was good for a while. */
 #define _GNU_SOURCE
 #include "said.h"
 
@@ -21,8 +21,8 @@ static void tells_each_reason_once(void **state)
     struct fl_reasons reasons = {0};
     struct said said = said_begin();
     for (int i = 0; i < 100; i++) {
-        fl_reasons_tell(&reasons, block, i, "a checksum is %s", "wrong");
-        fl_reasons_tell(&reasons, block, i, "fault %d", 7);
+        fl_reasons_log(&reasons, block, i, "a checksum is %s", "wrong");
+        fl_reasons_log(&reasons, block, i, "fault %d", 7);
         fl_reasons_good(&reasons, i); /* frames between the wrong ones */
     }
     assert_int_equal(said_times(&said, "probe: a checksum is wrong\n"), 1);
@@ -37,14 +37,14 @@ static void tells_it_anew_after_the_device_was_good(void **state)
     struct fl_block *block = testbed_block("probe", NULL);
     struct fl_reasons reasons = {0};
     struct said said = said_begin();
-    fl_reasons_tell(&reasons, block, SECOND_NS, "fault");
+    fl_reasons_log(&reasons, block, SECOND_NS, "fault");
     fl_reasons_good(&reasons, FL_REASONS_STEADY_S * SECOND_NS); /* a second too early */
-    fl_reasons_tell(&reasons, block, FL_REASONS_STEADY_S * SECOND_NS, "fault");
+    fl_reasons_log(&reasons, block, FL_REASONS_STEADY_S * SECOND_NS, "fault");
     assert_int_equal(said_times(&said, "fault"), 1);
-    fl_reasons_tell(&reasons, block, 3 * FL_REASONS_STEADY_S * SECOND_NS, "fault"); /* never good since */
+    fl_reasons_log(&reasons, block, 3 * FL_REASONS_STEADY_S * SECOND_NS, "fault"); /* never good since */
     assert_int_equal(said_times(&said, "fault"), 1);
     fl_reasons_good(&reasons, 4 * FL_REASONS_STEADY_S * SECOND_NS);
-    fl_reasons_tell(&reasons, block, 4 * FL_REASONS_STEADY_S * SECOND_NS, "fault");
+    fl_reasons_log(&reasons, block, 4 * FL_REASONS_STEADY_S * SECOND_NS, "fault");
     assert_int_equal(said_times(&said, "fault"), 2);
     said_end(&said);
     testbed_end(block);
@@ -60,7 +60,7 @@ static void tells_no_more_than_so_many(void **state)
     memset(endless, 'x', sizeof endless - 1);
     endless[sizeof endless - 1] = '\0';
     for (int i = 0; i < 1000; i++)
-        fl_reasons_tell(&reasons, block, i, "%d %s", i, endless);
+        fl_reasons_log(&reasons, block, i, "%d %s", i, endless);
     assert_int_equal(said_times(&said, "probe: "), FL_REASONS);
     said_end(&said);
     testbed_end(block);

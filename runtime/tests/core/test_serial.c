@@ -1,7 +1,7 @@
 /* The serial port itself, with a pseudo terminal for a device. */
 #define _GNU_SOURCE
+#include "line.h"
 #include "said.h"
-#include "serial/line.h"
 
 #include <asm/termbits.h>
 #include <errno.h>
@@ -110,7 +110,7 @@ enum { SEND_NOTHING, SEND_REASON, SEND_ANSWER, SEND_LOUD };
 
 static const struct fl_parameter parameters[] = {
     FL_SERIAL_PARAMETERS(struct probe, "9600"),
-    FL_PARAMETER(struct probe, send, .fallback = "nothing", .choices = "nothing|reason|answer|loud",
+    FL_PARAMETER(struct probe, send, .default_value = "nothing", .choices = "nothing|reason|answer|loud",
                  .summary = "replies"),
 };
 
@@ -216,7 +216,7 @@ static void newest_is_the_newest_however_slow_the_step(void **state)
     memset(many, 'x', sizeof many);
     many[sizeof many - 1] = 'z';
     line_write(&bench.line, many, sizeof many);
-    assert_true(line_hears(&bench.line, "bs"));
+    assert_true(line_receives(&bench.line, "bs"));
     assert_true(take_newest(&bench));
     assert_int_equal(bench.counted.value, 'z');
     assert_int_equal(bench.sequence, 1500);
@@ -228,14 +228,14 @@ static void each_in_turn_and_what_is_lost_is_seen(void **state)
     (void)state;
     struct bench bench = bench_create(&each, "reason");
     line_say(&bench.line, "abc");
-    assert_true(line_hears(&bench.line, "b")); /* the batch is done */
+    assert_true(line_receives(&bench.line, "b")); /* the batch is done */
     for (const char *expected = "abc"; *expected; expected++) {
         AWAIT(take_next(&bench));
         assert_int_equal(bench.counted.value, *expected);
     }
     assert_int_equal(bench.sequence, 3);
     line_say(&bench.line, "0123456789ab");
-    assert_true(line_hears(&bench.line, "b"));
+    assert_true(line_receives(&bench.line, "b"));
     AWAIT(take_newest(&bench));
     assert_int_equal(bench.sequence, 11);
     assert_int_equal(bench.counted.value, '7');
@@ -249,10 +249,10 @@ static void comes_back_after_unplugging(void **state)
 {
     (void)state;
     struct bench bench = bench_create(&newest, "reason");
-    assert_true(line_hears(&bench.line, "o"));
+    assert_true(line_receives(&bench.line, "o"));
     line_say(&bench.line, "ab");
     AWAIT(take_newest(&bench) && bench.counted.value == 'b');
-    assert_true(line_hears(&bench.line, "bs"));
+    assert_true(line_receives(&bench.line, "bs"));
     assert_true(fl_serial_send(bench.serial, (const uint8_t *)"!", 1)); /* 100 ms of silence lie before it */
     line_unplug(&bench.line);
     AWAIT(!fl_serial_connected(bench.serial));
@@ -260,17 +260,17 @@ static void comes_back_after_unplugging(void **state)
     assert_false(take_newest(&bench));
     line_plug(&bench.line);
     AWAIT(fl_serial_connected(bench.serial));
-    assert_true(line_hears(&bench.line, "o"));
+    assert_true(line_receives(&bench.line, "o"));
     line_say(&bench.line, "c");
     AWAIT(take_newest(&bench));
     assert_int_equal(bench.counted.value, 'c');
     assert_int_equal(bench.counted.fed, 1); /* the parser began anew, */
     assert_int_equal(bench.sequence, 3);    /* the sequence did not */
     for (const char *until = "bs"; *until;) {
-        char heard;
-        assert_int_equal(read(bench.line.master, &heard, 1), 1);
-        assert_int_not_equal(heard, '!'); /* a stale command */
-        until += heard == *until;
+        char received;
+        assert_int_equal(read(bench.line.master, &received, 1), 1);
+        assert_int_not_equal(received, '!'); /* a stale command */
+        until += received == *until;
     }
     bench_destroy(&bench);
 }
@@ -280,7 +280,7 @@ static void sends_what_the_step_queues(void **state)
     (void)state;
     struct bench bench = bench_create(&newest, "nothing");
     assert_true(fl_serial_send(bench.serial, (const uint8_t *)"zero", 4));
-    assert_true(line_hears(&bench.line, "zero")); /* though the device is silent */
+    assert_true(line_receives(&bench.line, "zero")); /* though the device is silent */
     uint8_t large[65] = {0};
     assert_false(fl_serial_send(bench.serial, large, sizeof large));
     bench_destroy(&bench);
@@ -290,13 +290,13 @@ static void says_why_it_sends(void **state)
 {
     (void)state;
     struct bench bench = bench_create(&newest, "reason");
-    assert_true(line_hears(&bench.line, "os"));
+    assert_true(line_receives(&bench.line, "os"));
     line_say(&bench.line, "x");
-    assert_true(line_hears(&bench.line, "bs"));
+    assert_true(line_receives(&bench.line, "bs"));
     assert_true(fl_serial_send(bench.serial, (const uint8_t *)"off", 3));
     fl_serial_stop(bench.serial);
-    assert_true(line_hears(&bench.line, "off"));
-    assert_true(line_hears(&bench.line, "c"));
+    assert_true(line_receives(&bench.line, "off"));
+    assert_true(line_receives(&bench.line, "c"));
     line_unplug(&bench.line);
     testbed_end(bench.block);
 }
@@ -337,25 +337,25 @@ static void fill(const struct line *line)
     close(fd);
 }
 
-/* A device that reads on once the thread was asked to return: what it heard other than the filling. */
+/* A device that reads on once the thread was asked to return: what it received other than the filling. */
 static void *read_on(void *argument)
 {
     const struct line *line = argument;
-    static char heard[16];
+    static char received[16];
     size_t count = 0;
     AWAIT(atomic_load(&stopping));
-    while (count < sizeof heard - 1) {
+    while (count < sizeof received - 1) {
         char bytes[4096];
         struct pollfd waiting = {.fd = line->master, .events = POLLIN};
         ssize_t got = poll(&waiting, 1, AWAIT_MS) == 1 ? read(line->master, bytes, sizeof bytes) : -1;
         for (ssize_t i = 0; i < got; i++)
             if (bytes[i])
-                heard[count++] = bytes[i];
-        if (got <= 0 || (count && heard[count - 1] == 'c'))
+                received[count++] = bytes[i];
+        if (got <= 0 || (count && received[count - 1] == 'c'))
             break;
     }
-    heard[count] = '\0';
-    return heard;
+    received[count] = '\0';
+    return received;
 }
 
 /* What makes a device safe is said last, and after whole commands: the laser goes off. */
@@ -363,17 +363,18 @@ static void ends_in_order_although_it_was_writing(void **state)
 {
     (void)state;
     struct bench bench = bench_create(&newest, "answer");
-    assert_true(line_hears(&bench.line, "o"));
+    assert_true(line_receives(&bench.line, "o"));
     fill(&bench.line);
     line_say(&bench.line, "x"); /* 'b' answers it, for which there is no room */
     AWAIT(take_newest(&bench));
     pthread_t device;
-    void *heard;
+    void *received;
     atomic_store(&stopping, false);
     assert_int_equal(pthread_create(&device, NULL, read_on, &bench.line), 0);
     fl_serial_stop(bench.serial);
-    assert_int_equal(pthread_join(device, &heard), 0);
-    assert_true(strcmp(heard, "bc") == 0 || strcmp(heard, "c") == 0); /* a slow computer gives 'b' up after a second */
+    assert_int_equal(pthread_join(device, &received), 0);
+    assert_true(strcmp(received, "bc") == 0 ||
+                strcmp(received, "c") == 0); /* a slow computer gives 'b' up after a second */
     line_unplug(&bench.line);
     testbed_end(bench.block);
 }
@@ -384,12 +385,12 @@ static void ends_although_the_port_is_stuck(void **state)
     (void)state;
     struct said said = said_begin();
     struct bench bench = bench_create(&newest, "answer");
-    assert_true(line_hears(&bench.line, "o"));
+    assert_true(line_receives(&bench.line, "o"));
     fill(&bench.line);
     line_say(&bench.line, "x");
     AWAIT(take_newest(&bench));
     fl_serial_stop(bench.serial);
-    assert_int_equal(said_times(&said, "takes no more bytes"), 1);
+    assert_int_equal(said_times(&said, "accepts no more bytes"), 1);
     said_end(&said);
     line_unplug(&bench.line);
     testbed_end(bench.block);

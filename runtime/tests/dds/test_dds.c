@@ -201,7 +201,7 @@ static void publishes_what_is_new_alone(void **state)
     testbed_end(from);
 }
 
-/* Who stands by is heard when the other is silent, and only then. */
+/* A hot standby is received while the first sender is silent, and only then. */
 static void another_stands_by(void **state)
 {
     (void)state;
@@ -230,7 +230,7 @@ static void another_stands_by(void **state)
     testbed_end(two);
     testbed_end(to);
     assert_non_null(strstr(testbed_refusal("dds-subscribe", "type", "wrench", "topic", "s", "robot", "1.5", NULL),
-                           "robot: 1.5 is no whole number"));
+                           "robot: 1.5 is not a whole number"));
     assert_non_null(strstr(testbed_refusal("dds-subscribe", "type", "wrench", "topic", "s", "robot", "1,2,3,4,5", NULL),
                            "robot: give 1 to 4 numbers"));
 }
@@ -361,7 +361,7 @@ static void what_waited_is_not_sent(void **state)
     testbed_end(to);
 }
 
-/* The lifespan that DDS knows of a topic's writer, in ns; 0: it has not heard of one. */
+/* The lifespan that DDS knows of a topic's writer, in ns; 0: it knows of none. */
 static int64_t lifespan_of(dds_entity_t publications, const char *topic)
 {
     enum { MOST = 16 };
@@ -420,10 +420,10 @@ static void passes_between_processes(void **state)
     if (child == 0)
         publish_for_ever(4.5);
     struct fl_block *to = subscriber((struct node){"state", "far", "7", NULL, NULL});
-    bool heard = reaches(to, "flag", 1, NULL);
+    bool received = reaches(to, "flag", 1, NULL);
     kill(child, SIGKILL);
     waitpid(child, NULL, 0);
-    assert_true(heard);
+    assert_true(received);
     assert_near(*(const double *)testbed_output(to, "state"), 4.5, 0);
     to->release_ns = fl_now_ns() + INT64_C(31000000000);
     assert_int_equal(testbed_step(to), FL_OK);

@@ -1,6 +1,6 @@
 /* libFuzzer's entry for the datagram of the indoor positioning system: no stream, so no subject of subject.h. What is
  * believed is checked against the bytes by other code than the parser's. */
-#include "blocks/io/igps_datagram.h"
+#include "blocks/devices/igps_datagram.h"
 
 #include <math.h>
 #include <stdlib.h>

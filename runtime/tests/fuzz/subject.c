@@ -1,10 +1,10 @@
 #define _GNU_SOURCE
 #include "subject.h"
 
-#include "blocks/serial/dsp3000_frame.h"
-#include "blocks/serial/micromag3_frame.h"
-#include "blocks/serial/oceanserver_frame.h"
-#include "blocks/serial/urg_frame.h"
+#include "blocks/devices/dsp3000_frame.h"
+#include "blocks/devices/micromag3_frame.h"
+#include "blocks/devices/oceanserver_frame.h"
+#include "blocks/devices/urg_frame.h"
 
 #include <math.h>
 #include <stdio.h>

@@ -2,7 +2,7 @@
 #include "testbed.h"
 
 #include "blocks/io/queue.h"
-#include "executive/service.h"
+#include "core/service.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -358,7 +358,7 @@ static void refuses(void **state)
         assert_non_null(strstr(testbed_refusal("queue-receive", "name", names[i], NULL), "parameter name: "));
     }
     assert_non_null(
-        strstr(testbed_refusal("queue-send", "name", name, "type", "float", NULL), "float is none of boolean|"));
+        strstr(testbed_refusal("queue-send", "name", name, "type", "float", NULL), "float is not one of boolean|"));
     assert_non_null(strstr(testbed_refusal("queue-send", "name", name, "width", "0", NULL), "0 is outside 1 to 1000"));
     assert_non_null(strstr(testbed_refusal("queue-send", NULL), "parameter name of queue-send is missing"));
 }

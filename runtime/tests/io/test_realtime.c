@@ -2,7 +2,7 @@
 #define _GNU_SOURCE
 #include "testbed.h"
 
-#include "blocks/io/ports.h"
+#include "blocks/devices/ports.h"
 #include "seccomp.h"
 
 #include <fcntl.h>

@@ -1,8 +1,8 @@
 #define _GNU_SOURCE
 #include "loopback.h"
 
-#include "blocks/io/udp.h"
-#include "executive/service.h"
+#include "core/service.h"
+#include "core/udp.h"
 
 #include <math.h>
 #include <netinet/ip.h>
@@ -337,7 +337,8 @@ static void counts_drops(void **state)
 }
 
 /* Strangers, and wrong lengths, before, between and after: more than a step takes, and more than the queue holds. The
- * true datagrams are taken in the next step, none of them is lost, and what is refused is told from what is lost. */
+ * true datagrams are taken in the next step, none of them is lost, and what is refused is counted apart from what is
+ * lost. */
 static void strangers_take_no_room(void **state)
 {
     (void)state;
@@ -346,11 +347,11 @@ static void strangers_take_no_room(void **state)
     const char *port = free_port();
     struct fl_block *receive =
         testbed_block("udp-receive", "port", port, "length", "1000", "from", "127.0.0.1,127.0.0.4", NULL);
-    int first = bare("127.0.0.1", 0), last = bare("127.0.0.4", 0), stranger = bare("127.0.0.2", 0);
+    int first = bare("127.0.0.1", 0), last = bare("127.0.0.4", 0), other = bare("127.0.0.2", 0);
     testbed_begin(receive);
     for (uint32_t round = 1; round <= 2; round++) {
         for (int i = 0; i < FLOOD; i++) {
-            send_unsettled(stranger, (uint16_t)atoi(port), datagram, LONG);
+            send_unsettled(other, (uint16_t)atoi(port), datagram, LONG);
             send_unsettled(i & 1 ? first : last, (uint16_t)atoi(port), datagram, i % 3 ? LONG - 1 : LONG + 1);
             if (i % 50 == 49)
                 settle();
@@ -365,7 +366,7 @@ static void strangers_take_no_room(void **state)
     }
     close(first);
     close(last);
-    close(stranger);
+    close(other);
     testbed_end(receive);
 }
 
@@ -456,7 +457,7 @@ static void refuses(void **state)
         {"udp-send", "length", "1473", "parameter length: 1473 is outside 1 to 1472 B"},
         {"udp-receive", "port", "65536", "parameter port: 65536 is outside 1 to 65535"},
         {"udp-receive", "length", "0", "parameter length: 0 is outside 1 to 1472 B"},
-        {"udp-receive", "take", "oldest", "oldest is none of newest|in-order"},
+        {"udp-receive", "take", "oldest", "oldest is not one of newest|in-order"},
         {"udp-receive", "timeout", "-1", "parameter timeout: -1 is outside 0.001 to 3600 s"},
     };
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
@@ -466,7 +467,7 @@ static void refuses(void **state)
     }
     assert_non_null(strstr(said_of_send("224.0.0.1", "0.0.0.0"), "224.0.0.1 is a multicast group"));
     assert_non_null(strstr(said_of_send("robot3", "0.0.0.0"), "address: robot3 is not an IPv4 address such as"));
-    assert_non_null(strstr(said_of_send("0.0.0.0", "0.0.0.0"), "0.0.0.0 is nowhere to send to"));
+    assert_non_null(strstr(said_of_send("0.0.0.0", "0.0.0.0"), "0.0.0.0 is not an address to send to"));
     assert_non_null(strstr(said_of_send("127.0.0.1", "::1"), "local_address: ::1 is not an IPv4 address"));
     assert_non_null(strstr(said_of_receive("0.0.0.0", "10.0.0"), "from: 10.0.0 is not an IPv4 address"));
     assert_non_null(strstr(said_of_receive("239.1.2.3", "0.0.0.0"), "239.1.2.3 is a multicast group"));

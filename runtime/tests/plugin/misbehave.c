@@ -21,9 +21,9 @@ static const struct fl_parameter misbehave_parameters[] = {
     FL_PARAMETER(struct misbehave, manner,
                  .choices = "fail|hang|late|allocate|start-fail|fault|abort|exit|"
                             "overflow|thread-fault|thread-exit|safe-fault|safe-hang"),
-    FL_PARAMETER(struct misbehave, from, .fallback = "0"),
-    FL_PARAMETER(struct misbehave, until, .fallback = "1000000000"),
-    FL_PARAMETER(struct misbehave, late_s, .fallback = "0.025"),
+    FL_PARAMETER(struct misbehave, from, .default_value = "0"),
+    FL_PARAMETER(struct misbehave, until, .default_value = "1000000000"),
+    FL_PARAMETER(struct misbehave, late_s, .default_value = "0.025"),
 };
 
 enum {
@@ -157,7 +157,7 @@ struct trace {
 
 static const struct fl_parameter trace_parameters[] = {
     FL_PARAMETER(struct trace, device),
-    FL_PARAMETER(struct trace, timeout, .flags = FL_ACTUATOR_TIMEOUT, .fallback = "1"),
+    FL_PARAMETER(struct trace, timeout, .flags = FL_ACTUATOR_TIMEOUT, .default_value = "1"),
 };
 
 static void trace_write(struct fl_block *block, const char *word)

@@ -68,7 +68,7 @@ static void refuses(void **state)
     assert_non_null(strstr(testbed_refusal("delay", "type", "uint8", "initial", "-1", NULL), "-1 does not fit"));
     assert_non_null(strstr(testbed_refusal("delay", "type", "single", "initial", "1e39", NULL), "does not fit single"));
     assert_non_null(strstr(testbed_refusal("delay", "type", "int8", "initial", "-129", NULL), "-129 does not fit"));
-    assert_non_null(strstr(testbed_refusal("delay", "type", "float", NULL), "float is none of"));
+    assert_non_null(strstr(testbed_refusal("delay", "type", "float", NULL), "float is not one of"));
 }
 
 /* Of a constant c: n h c after n steps; of the step's number: the sum of all before. */

@@ -43,7 +43,7 @@ static void selects(void **state)
 static void refuses(void **state)
 {
     (void)state;
-    assert_non_null(strstr(testbed_refusal("logic", "operation", "imply", NULL), "imply is none of and|or|xor|not"));
+    assert_non_null(strstr(testbed_refusal("logic", "operation", "imply", NULL), "imply is not one of and|or|xor|not"));
     assert_non_null(strstr(testbed_refusal("logic", "inputs", "0", NULL), "0 is outside 1 to 32"));
 }
 

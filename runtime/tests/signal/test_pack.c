@@ -183,7 +183,8 @@ static void refuses(void **state)
     assert_non_null(
         strstr(testbed_refusal("pack", "types", "int8,int8", "names", "a,a", NULL), "there is a port a already"));
     assert_non_null(strstr(testbed_refusal("pack", "types", "int8", "names", "a.b", NULL), "names: \"a.b\" is not"));
-    assert_non_null(strstr(testbed_refusal("pack", "types", "int8", "alignment", "3", NULL), "3 is none of 1|2|4|8"));
+    assert_non_null(
+        strstr(testbed_refusal("pack", "types", "int8", "alignment", "3", NULL), "3 is not one of 1|2|4|8"));
     assert_non_null(
         strstr(testbed_refusal("unpack", "types", "int8", "names", "flag", NULL), "there is a port flag already"));
     assert_non_null(

@@ -219,8 +219,8 @@ static void refuses(void **state)
     assert_non_null(strstr(testbed_refusal("pid", "min", "1", "max", "0", NULL), "min 1 is above max 0"));
     assert_non_null(strstr(testbed_refusal("pid", "min", "0", "max", "1", "filter", "-1", NULL), "outside 0 to inf s"));
     assert_non_null(strstr(testbed_refusal("pid", "max", "1", NULL), "parameter min of pid is missing"));
-    assert_non_null(
-        strstr(testbed_refusal("pid", "min", "0", "max", "1", "anti_windup", "off", NULL), "off is none of clamping"));
+    assert_non_null(strstr(testbed_refusal("pid", "min", "0", "max", "1", "anti_windup", "off", NULL),
+                           "off is not one of clamping"));
 }
 
 int main(void)

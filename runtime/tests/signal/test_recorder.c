@@ -1,7 +1,7 @@
 #define _GNU_SOURCE
 #include "testbed.h"
 
-#include "executive/service.h"
+#include "core/service.h"
 
 #include <dirent.h>
 #include <inttypes.h>
@@ -323,7 +323,7 @@ static void gives_up_on_a_disk_without_any_room(void **state)
 static void is_readable_after_a_kill(void **state)
 {
     (void)state;
-    char first[512], last[512], told;
+    char first[512], last[512], byte;
     struct reading reading;
     int ends[2];
     assert_int_equal(pipe(ends), 0);
@@ -338,7 +338,7 @@ static void is_readable_after_a_kill(void **state)
         }
     }
     close(ends[1]);
-    assert_int_equal(read(ends[0], &told, 1), 1);
+    assert_int_equal(read(ends[0], &byte, 1), 1);
     assert_int_equal(kill(child, SIGKILL), 0);
     assert_int_equal(waitpid(child, NULL, 0), child);
     close(ends[0]);

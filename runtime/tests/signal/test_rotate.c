@@ -52,7 +52,7 @@ static void returns(void **state)
     assert_true(isnan(GET(into, "x", double)));
     testbed_end(into);
     testbed_end(back);
-    assert_non_null(strstr(testbed_refusal("rotate", "direction", "in", NULL), "in is none of into|out-of"));
+    assert_non_null(strstr(testbed_refusal("rotate", "direction", "in", NULL), "in is not one of into|out-of"));
 }
 
 int main(void)

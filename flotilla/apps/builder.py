@@ -1,0 +1,158 @@
+"""Builds an app for a board, by the locked compiler: the files as they lie on the robot."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from flotilla.apps import app, ert, fmu
+from flotilla.common import cache, paths, progress
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Board
+from images.builder import runtime, toolchain
+
+_BUILT = ("*.o", "*.d", ".git")
+"""What a copy of a project leaves out: what its own build left behind may be for another processor."""
+_NO_DATA = re.compile(
+    r"[^.]*|\..*|.*\.(c|h|cc|cpp|cxx|hh|hpp|hxx|inc|s|S|asm|o|d|a|mk|am|ac|in|cmake|py|sh|md|rst)"
+    r"|(app|safe)\.yml|(CMakeLists|README|LICENSE)\.txt"
+)
+"""Names of what a project consists of and its program does without, if nobody says otherwise."""
+
+
+def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolchain.run) -> None:
+    """Fill `out` with what goes to a robot of `board`; UserError with the compiler's or the runtime's own words.
+
+    `run` says where the robot's code is compiled.
+    """
+    paths.BUILD.mkdir(parents=True, exist_ok=True)
+    with cache.exclusive(), progress.step(f"{subject.name} for {board.architecture}"):
+        (out / "unit.d").mkdir(parents=True)  # what the app's service has beyond runtime/systemd/
+        description = subject.description
+        try:
+            if isinstance(description, app.Make):
+                _make(subject, description, board.architecture, out, run)
+            elif isinstance(description, app.Ert):
+                with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".ert-") as work:
+                    source = Path(work) / "source"
+                    model, times_s = description.model, description.sample_times
+                    ert.block(subject.directory, model, subject.name, times_s, source, board.architecture)
+                    try:
+                        _blocks(subject, source, ("-Wall",), board.architecture, out, run)
+                    except UserError as error:
+                        raise ert.explained(error, board.architecture) from None
+            elif isinstance(description, app.Fmu):
+                _fmu(subject, description, board.architecture, out, run)
+            else:
+                _blocks(subject, subject.directory, runtime.WARNINGS, board.architecture, out, run)
+        except UserError as error:
+            raise UserError(f"{paths.shown(subject.directory)}: nothing was built: {error}") from None
+
+
+def _blocks(
+    subject: app.App, source: Path, options: Sequence[str], architecture: str, out: Path, run: toolchain.Run
+) -> None:
+    """The plug-in of all that is in `source`, and the task; the runtime judges both as the robot would."""
+    task = subject.directory / app.TASK
+    (out / "blocks").mkdir()
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".blocks-") as directory:
+        if any(source.glob("*.c")):
+            plugin = runtime.compile_plugin(source, architecture, options, run)
+            (out / "blocks" / f"{subject.name}.so").write_bytes(plugin)
+            (Path(directory) / f"{subject.name}.so").write_bytes(plugin)
+            runtime.check_plugins(Path(directory), architecture)
+        runtime.check_task(task, task.read_bytes(), Path(directory), architecture)
+    shutil.copyfile(task, out / app.TASK)
+
+
+def _fmu(subject: app.App, description: app.Fmu, architecture: str, out: Path, run: toolchain.Run) -> None:
+    """The unit, and the plug-in that calls it."""
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as work:
+        unit = fmu.read(*fmu.unpacked(subject.directory, description.unit, Path(work) / "unit"))
+        fmu.block(unit, subject.name, Path(work) / "source")
+        _blocks(subject, Path(work) / "source", runtime.WARNINGS, architecture, out, run)
+        fmu.build(unit, subject.name, architecture, out, run)
+
+
+def _make(subject: app.App, description: app.Make, architecture: str, out: Path, run: toolchain.Run) -> None:
+    """The program, and how its service differs from a task's."""
+    safe = subject.directory / app.SAFE
+    if safe.exists():
+        runtime.check_task(safe, safe.read_bytes())
+        shutil.copyfile(safe, out / app.SAFE)
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".make-") as directory:
+        source = Path(directory) / "source"
+        shutil.copytree(subject.directory, source, symlinks=True, ignore=shutil.ignore_patterns(*_BUILT))
+        made = source / description.program
+        made.unlink(missing_ok=True)
+        # From the environment, because a Makefile may add to these; it cannot to what stands on make's command line.
+        variables = ["CC=gcc", "AR=ar", "PKG_CONFIG=pkg-config", "CFLAGS=-O2 -I/out/include"]
+        variables += ["LDFLAGS=-Wl,--build-id=none"]
+        runtime.command(Path(directory), architecture, ["env", "-C", "/out/source", *variables, "make"], run)
+        if not made.is_file():
+            where = paths.shown(subject.directory / app.FILE)
+            raise UserError(f"{where}: program: {description.program}: make does not make it; name what it makes")
+        program = out / made.name
+        shutil.copyfile(made, program)
+        program.chmod(0o755)
+        _send_along(subject, description, source, out)
+    (out / "unit.d" / "program.conf").write_text(service(subject, description, safe=safe.exists()))
+
+
+def _send_along(subject: app.App, description: app.Make, source: Path, out: Path) -> None:
+    """What the program needs beside it; UserError where that may be left here without a word."""
+    where = paths.shown(subject.directory / app.FILE)
+    for name in description.files or []:
+        sent, taken = source / name, out / name
+        if not sent.exists():
+            raise UserError(f"{where}: files: {name}: is not there, and make does not make it; name what there is")
+        if taken.exists():
+            raise UserError(f"{where}: files: {name}: is sent anyhow; leave it out, or give it another name")
+        if any(path.is_symlink() and not path.resolve().is_relative_to(source.resolve()) for path in _below(sent)):
+            raise UserError(f"{where}: files: {name}: has a link to outside the app; put a copy in its place")
+        taken.parent.mkdir(parents=True, exist_ok=True)
+        if sent.is_dir():
+            shutil.copytree(sent, taken)
+        else:
+            shutil.copy(sent, taken)
+    if description.files is None and (left := _left(subject, description, source)):
+        listed = ", ".join(left[:5]) + (", …" if len(left) > 5 else "")
+        remedy = f"write files: [{left[0]}] for what the program needs there, files: [] for nothing"
+        raise UserError(f"{where}: files: (nothing): would leave {listed} here; {remedy}")
+
+
+def _left(subject: app.App, description: app.Make, source: Path) -> list[str]:
+    """What the program may need, and does not get: data of the project, and libraries that make made."""
+    data = {path.relative_to(subject.directory) for path in _below(subject.directory) if path.is_file()}
+    hidden = {path for path in data if any(part.startswith(".") for part in path.parts)}
+    data = {path for path in data - hidden if not _NO_DATA.fullmatch(path.name)}
+    libraries = {path.relative_to(source) for path in _below(source) if ".so" in path.suffixes}
+    return sorted(str(path) for path in (data | libraries) - {Path(description.program)})
+
+
+def _below(path: Path) -> list[Path]:
+    return [path, *path.rglob("*")]
+
+
+def service(subject: app.App, description: app.Make, *, safe: bool) -> str:
+    """A drop-in for flotilla-app@.service: a program instead of a task."""
+    place = app.on_robot(subject.name)
+    command = [str(place / Path(description.program).name), *description.arguments]
+    # At a task's nice value a program that computes at ordinary priority leaves 1 % of a processor to all others.
+    lines = ["[Service]", f"WorkingDirectory={place}", "Nice=0"]
+    lines += ["ExecStart=", f"ExecStart={' '.join(map(_quoted, command))}", "ExecStopPost="]
+    if safe:
+        lines.append(f"ExecStopPost=/usr/bin/flotilla-run --safe {place / app.SAFE}")
+    if not description.notify:
+        lines += ["Type=exec", "WatchdogSec=0"]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(word: str) -> str:
+    """A word of a unit's command line (systemd.service(5))."""
+    for character, written in (("\\", "\\\\"), ('"', '\\"'), ("\n", "\\n"), ("%", "%%"), ("$", "$$")):
+        word = word.replace(character, written)
+    return f'"{word}"'

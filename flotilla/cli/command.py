@@ -1,0 +1,28 @@
+"""What a word of the command line is: `flotilla WORD …`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+def no_arguments(_: argparse.ArgumentParser) -> None:
+    """Of a command that takes none."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command. Both functions import what they need when they are called, so that help and errors come at once."""
+
+    group: str
+    """Heading in the help."""
+    name: str
+    help: str
+    run: Callable[[argparse.Namespace], None]
+    """Does it; prints the result on standard output, raises UserError where the user can help."""
+    arguments: Callable[[argparse.ArgumentParser], None] = no_arguments
+
+
+def robot_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robot", type=int, help="number in the inventory")

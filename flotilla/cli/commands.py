@@ -1,0 +1,351 @@
+"""The commands about cards, robots, apps and the station; `lab/commands.py` has those of the lab."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from flotilla.cli.command import Command, robot_argument
+
+
+def _image(arguments: argparse.Namespace) -> None:
+    from flotilla.apps import assigned
+    from flotilla.common.errors import UserError
+    from flotilla.fleet import inventory
+    from images.builder import build
+
+    if arguments.all == (arguments.robot is not None):
+        raise UserError("say which: a robot's number, or --all")
+    fleet = inventory.load_fleet()
+    robots = list(fleet.robots.values()) if arguments.all else [inventory.robot(fleet, arguments.robot)]
+    build.build(fleet, robots, apps=assigned.built(fleet, robots))
+
+
+def _image_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robot", type=int, nargs="?", help="number in the inventory")
+    parser.add_argument("--all", action="store_true", help="every robot of the fleet")
+
+
+def _flash(arguments: argparse.Namespace) -> None:
+    from flotilla.common.errors import UserError
+    from flotilla.fleet import inventory
+    from images.builder import build, flash
+
+    if (arguments.device is None) == (arguments.file is None):
+        raise UserError("say where to: the card's device, /dev/sdX, or --file FILE")
+    robot = inventory.robot(inventory.load_fleet(), arguments.robot)
+    flash.flash(
+        build.image_of(robot), device=arguments.device, file=arguments.file, force=arguments.force, yes=arguments.yes,
+        robot=str(robot.number),
+    )  # fmt: skip
+
+
+def _flash_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("device", type=Path, nargs="?", help="the card: /dev/sdX")
+    parser.add_argument("--file", type=Path, help="a file instead of a card")
+    parser.add_argument("--force", help="the word that an earlier refusal named")
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+
+
+def _kernel(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from images.builder import kernel
+
+    print(kernel.report([arguments.board or inventory.load_fleet().board().name]))
+
+
+def _kernel_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("board", nargs="?", help="a board, or another name in kernel/ (the first robot's board)")
+
+
+def _verify(arguments: argparse.Namespace) -> None:
+    from flotilla.apps import assigned
+    from flotilla.fleet import inventory
+    from images.builder import verify
+
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    print(verify.verify(fleet, robot, assigned.built(fleet, [robot])[robot.name], plant=arguments.plant))
+
+
+def _verify_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("--plant", action="store_true", help="plant a difference, which must be found")
+
+
+def _size(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from images.builder import build, size
+
+    robot = inventory.robot(inventory.load_fleet(), arguments.robot)
+    print(size.report(build.image_of(robot), remedy=f"make image ROBOT={robot.number}"))
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from images.builder import bench
+
+    fleet = inventory.load_fleet()
+    robot = next(iter(fleet.robots)) if arguments.robot is None else arguments.robot
+    print(bench.bench(fleet, inventory.robot(fleet, robot)))
+
+
+def _bench_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robot", type=int, nargs="?", help="number in the inventory (the first)")
+
+
+def _lock(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from images.builder import lock
+
+    recipes = lock.recipes(inventory.load_fleet().boards.values())
+    print(lock.update_locks(lock.chosen(recipes, arguments.only)))
+
+
+def _lock_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--only", action="append", default=[], metavar="NAME", help="this lock (all)")
+
+
+def _bundle(arguments: argparse.Namespace) -> None:
+    from flotilla.common import paths, progress
+    from flotilla.fleet import inventory
+    from flotilla.robot import release
+    from flotilla.updates import delta
+    from images.builder import bundle
+
+    fleet = inventory.load_fleet()
+    board = fleet.board(arguments.board)
+    final = bundle.file_of(board.name)
+    before = final.with_suffix(".before")
+    if final.exists():
+        final.replace(before)
+    try:
+        bundle.make(fleet, board, arguments.signature)
+    except BaseException:
+        if before.exists():
+            before.replace(final)
+        raise
+    if before.exists() and (made := delta.between(release.read(before), release.read(final))):
+        print(f"{paths.shown(made)}: {progress.size(made.stat().st_size)} for robots with the release before")
+
+
+def _bundle_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("board", nargs="?", help="a board (the first robot's)")
+    parser.add_argument("--signature", type=Path, action="append", default=[], help="one that was made elsewhere")
+
+
+def _cve(arguments: argparse.Namespace) -> None:
+    from flotilla.common.errors import UserError
+    from flotilla.fleet import inventory
+    from images.builder import cve
+
+    report = cve.check(inventory.load_fleet(), arguments.tracker, arguments.today)
+    print((cve.as_json if arguments.json else cve.table)(report, arguments.today))
+    if report.failures:
+        raise UserError("\n".join(report.failures))
+
+
+def _cve_arguments(parser: argparse.ArgumentParser) -> None:
+    from datetime import date
+
+    parser.add_argument("--tracker", metavar="FILE", help="the security tracker's data, or their address")
+    parser.add_argument("--today", type=date.fromisoformat, metavar="DATE", help="judge ages as of then: 2026-01-31")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def _check_fleet(_: argparse.Namespace) -> None:
+    from flotilla.apps import assigned
+    from flotilla.fleet import inventory
+
+    fleet = inventory.load_fleet()
+    assigned.check(fleet, fleet.robots.values())
+    print(inventory.summary(fleet))
+
+
+def _rotate_key(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import identity, inventory
+
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    if arguments.retire:
+        identity.retire_host_key(fleet, robot)
+        print(f"{robot.name}: this computer accepts its old host key no more")
+    else:
+        identity.rotate_host_key(fleet, robot)
+        print(
+            f"{robot.name}: has a new host key; bring it there with `make provision ROBOT={robot.number}`, "
+            f"then `make rotate-key ROBOT={robot.number} RETIRE=1`"
+        )
+
+
+def _rotate_key_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("--retire", action="store_true", help="accept the old key no more")
+
+
+def _ssh(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from flotilla.robot import ssh
+
+    ssh.shell(inventory.robot(inventory.load_fleet(), arguments.robot))
+
+
+def _releases(arguments: argparse.Namespace) -> None:
+    from flotilla.common.errors import UserError
+    from flotilla.fleet import inventory
+    from flotilla.robot import releases
+
+    fleet = inventory.load_fleet()
+    robots = list(fleet.robots.values()) if arguments.robot is None else [inventory.robot(fleet, arguments.robot)]
+    answers = releases.ask(robots)
+    print((releases.as_json if arguments.json else releases.table)(answers))
+    if silent := releases.problems(answers):
+        raise UserError("\n".join(silent))
+
+
+def _releases_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robot", type=int, nargs="?", help="number in the inventory (all)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def _hwcheck(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from flotilla.robot import hwcheck
+
+    print(hwcheck.check(inventory.robot(inventory.load_fleet(), arguments.robot), arguments.seconds))
+
+
+def _hwcheck_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("--seconds", type=int, default=60, help="to look for hardware latency (%(default)s)")
+
+
+def _param(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from flotilla.robot import parameters
+
+    robot = inventory.robot(inventory.load_fleet(), arguments.robot)
+    print(parameters.param(robot, arguments.task, arguments.parameter, arguments.value))
+
+
+def _param_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("task", help="which runs on the robot")
+    parser.add_argument("parameter", nargs="?", help="block.parameter; all by default")
+    parser.add_argument("value", nargs="?", help="what to set it to; a negative one after --")
+
+
+def _new_app(arguments: argparse.Namespace) -> None:
+    from flotilla.apps import scaffold
+
+    print(scaffold.create(arguments.kind, arguments.name))
+
+
+def _new_app_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("kind", help="block, ert, fmu or make")
+    parser.add_argument("name", help="of the app, and of its directory in apps/")
+
+
+def _deploy(arguments: argparse.Namespace) -> None:
+    import functools
+
+    from flotilla.apps import app, deploy, remote
+    from flotilla.fleet import inventory
+
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    with remote.connection(robot) as to:
+        if arguments.run:
+            print(deploy.command(to, app.name_of(arguments.app), arguments.run))
+        else:
+            board, show = fleet.boards[robot.board], functools.partial(print, flush=True)
+            options = {"keep": arguments.keep, "on_robot": arguments.on_robot}
+            print(deploy.deploy(to, arguments.app, board, show=show, **options))
+
+
+def _deploy_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("app", type=Path, help="the app's directory")
+    parser.add_argument("--run", help="start, stop, status, log or remove what is on the robot")
+    parser.add_argument("--keep", action="store_true", help="start it with the robot")
+    parser.add_argument("--on-robot", action="store_true", help="compile it on the robot")
+
+
+def _station(arguments: argparse.Namespace) -> None:
+    from flotilla.station import command
+
+    command.run(arguments)
+
+
+def _record_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import command
+
+    command.record_arguments(parser)
+
+
+def _live_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import command
+
+    command.live_arguments(parser)
+
+
+def _top_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import command
+
+    command.top_arguments(parser)
+
+
+def _provision(arguments: argparse.Namespace) -> None:
+    from flotilla.robot import playbook
+
+    playbook.play(arguments.playbook, robot=arguments.robot, guests=arguments.guests, words=arguments.words)
+
+
+def _provision_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--robot", type=int, help="this one only")
+    parser.add_argument("--guests", action="store_true", help="the virtual fleet instead of the robots")
+    parser.add_argument("--playbook", default="fleet", help="of ansible/ (%(default)s)")
+    parser.add_argument(
+        "words", nargs="*", metavar="-- …", help="what ansible-playbook is given, too: -- --check --diff"
+    )
+
+
+def _completion(arguments: argparse.Namespace) -> None:
+    import shtab
+
+    from flotilla.cli.main import commands, parser
+
+    print(shtab.complete(parser(commands(), lambda _: True), shell=arguments.shell))
+
+
+def _completion_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="which one")
+
+
+COMMANDS = (
+    Command("Cards", "image", "make the card image of a robot, or of all", _image, _image_arguments),
+    Command("Cards", "flash", "write a card and read it back", _flash, _flash_arguments),
+    Command("Cards", "kernel", "build a kernel of our own as a Debian package", _kernel, _kernel_arguments),
+    Command("Cards", "verify", "build a second time in other circumstances and compare every byte", _verify,
+            _verify_arguments),
+    Command("Cards", "size", "show the largest packages and files of a robot's image", _size, robot_argument),
+    Command("Cards", "bundle", "make the update bundle of a board", _bundle, _bundle_arguments),
+    Command("Cards", "bench", "measure builds against other builders", _bench, _bench_arguments),
+    Command("Inputs", "check-fleet", "check the fleet's description", _check_fleet),
+    Command("Inputs", "lock", "resolve the package lists to exact versions", _lock, _lock_arguments),
+    Command("Inputs", "cve", "name known vulnerabilities of what the locks hold", _cve, _cve_arguments),
+    Command("Inputs", "rotate-key", "give a robot a new host key", _rotate_key, _rotate_key_arguments),
+    Command("Robots", "ssh", "open a shell on a robot, or on its guest when one runs", _ssh, robot_argument),
+    Command("Robots", "param", "read or set parameters of a running task or app", _param, _param_arguments),
+    Command("Robots", "releases", "show which release each robot runs", _releases, _releases_arguments),
+    Command("Robots", "hwcheck", "report a robot's hardware", _hwcheck, _hwcheck_arguments),
+    Command("Robots", "provision", "make robots what the inventory says", _provision, _provision_arguments),
+    Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
+    Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
+    Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
+    Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
+    Command("Shell", "completion", "print what makes a shell complete these words", _completion,
+            _completion_arguments),
+)  # fmt: skip

@@ -1,0 +1,70 @@
+"""The command line: finds the commands, reads the words, says errors in one way."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import entry_points
+from itertools import groupby
+
+from flotilla.cli.command import Command
+from flotilla.common.errors import UserError
+
+GROUP = "flotilla.commands"
+"""Entry points, each a tuple of `Command`, in pyproject.toml: so the lab has commands, and nothing here knows it."""
+
+
+def commands() -> list[Command]:
+    return [command for found in sorted(entry_points(group=GROUP), key=lambda e: e.name) for command in found.load()]
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Without argparse's own list of commands: that one knows no headings."""
+
+    def _format_action(self, action: argparse.Action) -> str:
+        return "" if isinstance(action, argparse._SubParsersAction) else super()._format_action(action)
+
+
+def parser(known: Sequence[Command], detailed: Callable[[Command], bool]) -> argparse.ArgumentParser:
+    """`detailed`: whose arguments are needed; to declare some imports a great deal."""
+    from importlib.metadata import version
+
+    width = max(len(command.name) for command in known)
+    listed = "\n\n".join(
+        "\n".join([group, *(f"  {command.name:{width}}  {command.help}" for command in members)])
+        for group, members in groupby(sorted(known, key=lambda command: command.group), lambda command: command.group)
+    )
+    main = argparse.ArgumentParser(
+        prog="flotilla",
+        description="Real-time Linux card images for a fleet of robots, and what is done with them.",
+        epilog=f"{listed}\n\n`flotilla COMMAND --help` says more.",
+        formatter_class=_Help,
+        usage="flotilla COMMAND …",
+    )
+    main.add_argument("--version", action="version", version=f"flotilla {version('flotilla')}")
+    words = main.add_subparsers(dest="command", required=True, prog="flotilla", metavar="COMMAND")
+    for command in known:
+        each = words.add_parser(
+            command.name, help=command.help, description=f"{command.help[0].upper()}{command.help[1:]}."
+        )
+        if detailed(command):
+            command.arguments(each)
+    return main
+
+
+def main() -> int:
+    os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"  # there are none, and to look for them reads every package
+    known = commands()
+    word = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
+    arguments = parser(known, lambda command: word in (command.name, "completion")).parse_args()
+    try:
+        next(command for command in known if command.name == arguments.command).run(arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt as interrupt:
+        print(f"error: interrupted; {str(interrupt) or 'the last good outputs are untouched'}", file=sys.stderr)
+        return 130
+    return 0

@@ -1,0 +1,137 @@
+"""Results of build steps, kept under the hash of everything that went into them.
+
+A result is a directory. It is made beside its place and renamed when complete, so that an interrupted build leaves
+nothing that could be taken for a result; what it left is removed by the next build.
+
+A build that succeeds removes old results: the newest of each kind stay, those that it used itself, and those that
+another process may be using.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import re
+import shutil
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from flotilla.common import host, paths, progress
+
+_KEPT = 4
+"""The newest results of a kind, which stay whoever used them: with two boards, the present one and the one before."""
+_IN_USE_S = 3600
+"""After its last use by any process."""
+_RESULT = re.compile(r"(.+)-[0-9a-f]{16}(\.part)?")
+_used: set[Path] = set()
+
+
+def digest(*parts: str | bytes | Path) -> str:
+    """SHA-256 over texts, and over files and directory trees with their names and executable bits."""
+    total = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            for path in sorted(part.rglob("*")) if part.is_dir() else [part]:
+                if "__pycache__" in path.parts or path.is_dir():
+                    continue
+                name = str(path.relative_to(part.parent))
+                if path.is_symlink():
+                    content, kind = str(path.readlink()).encode(), "link"
+                else:
+                    content, kind = path.read_bytes(), "x" if os.access(path, os.X_OK) else "-"
+                total.update(f"{kind} {len(name)} {name} {len(content)}\n".encode() + content)
+        else:
+            data = part.encode() if isinstance(part, str) else part
+            total.update(f"text {len(data)}\n".encode() + data)
+    return total.hexdigest()
+
+
+def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
+    """The directory that `make` fills, made once per `kind` and `key`."""
+    final = paths.CACHE / f"{kind}-{key[:16]}"
+    _used.add(final)
+    if not final.exists():
+        with locked(paths.CACHE / f".{final.name}.lock"):
+            if not final.exists():  # nobody else made it meanwhile
+                _make(final, make)
+    os.utime(final)  # it was of use just now: see `clean`
+    return final
+
+
+def has(kind: str, key: str) -> bool:
+    """Whether `result` would have nothing to make."""
+    return (paths.CACHE / f"{kind}-{key[:16]}").exists()
+
+
+def _make(final: Path, make: Callable[[Path], None]) -> None:
+    beside = final.with_name(final.name + ".part")
+    discard(beside)
+    beside.mkdir(parents=True)
+    try:
+        with host.explaining_a_full_disk():
+            make(beside)
+        beside.rename(final)
+    finally:
+        discard(beside)
+
+
+def discard(directory: Path) -> None:
+    """Remove a directory tree, if it is there, read-only directories included."""
+    if directory.exists():
+        for parent, _, _ in os.walk(directory):
+            Path(parent).chmod(0o755)
+        shutil.rmtree(directory)
+
+
+@contextmanager
+def exclusive() -> Iterator[None]:
+    """One build of images or apps at a time in a build directory: a second one waits for the first."""
+    with locked(paths.CACHE / ".lock"):
+        yield
+        clean()
+
+
+@contextmanager
+def locked(file: Path) -> Iterator[None]:
+    """Hold a lock for as long as the body runs: whoever else asks for it waits, and says so."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            with progress.step(f"wait for another command that holds {paths.shown(file)}"):
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def clean() -> None:
+    """Remove the results that nobody uses, but for the last used of each kind."""
+    newest = time.time() - _IN_USE_S
+    kinds: dict[str, list[Path]] = defaultdict(list)
+    for path in paths.CACHE.iterdir():
+        if match := _RESULT.fullmatch(path.name):
+            kinds[match[1]].append(path)
+    for results in kinds.values():
+        results.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+        for old in set(results[_KEPT:]) - _used:
+            if old.exists() and old.stat().st_mtime < newest:
+                _remove(old)
+
+
+def _remove(old: Path) -> None:
+    """A result, or what is left of one, unless it is being made: its age says nothing while archives are unpacked."""
+    name = old.name.removesuffix(".part")
+    with (paths.CACHE / f".{name}.lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
+        leaving = old.with_name(f"{name}.part")  # which is no result's name, should this be interrupted
+        if leaving != old:
+            discard(leaving)
+            old.rename(leaving)
+        discard(leaving)

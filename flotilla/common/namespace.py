@@ -1,0 +1,116 @@
+"""Run a build stage as root of a world of its own, without being root.
+
+The stage gets its own mount, process and (for ordinary users) user namespace. Whatever it mounts and starts ends with
+it: when the builder dies, however it dies, the kernel ends the stage and takes its mounts away.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from flotilla.common import paths, progress
+from flotilla.common.errors import UserError
+
+
+def _refusal(stderr: str) -> UserError:
+    """What a host that forbids namespaces means for its user."""
+    reasons = [
+        (Path("/proc/sys/kernel/unprivileged_userns_clone"), "0", "sudo sysctl kernel.unprivileged_userns_clone=1"),
+        (Path("/proc/sys/user/max_user_namespaces"), "0", "sudo sysctl user.max_user_namespaces=10000"),
+        (
+            Path("/proc/sys/kernel/apparmor_restrict_unprivileged_userns"),
+            "1",
+            "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0",
+        ),
+    ]
+    for setting, forbidding, remedy in reasons:
+        if os.geteuid() != 0 and setting.exists() and setting.read_text().strip() == forbidding:
+            return UserError(
+                f"{setting}: {forbidding}: this computer forbids user namespaces, which building without root needs; "
+                f"allow them with `{remedy}`, or build as root with `sudo make image …`"
+            )
+    if os.geteuid() != 0 and ("subuid" in stderr or "newuidmap" in stderr or "uid_map" in stderr):
+        return UserError(
+            f"/etc/subuid: no range for {os.environ.get('USER', os.getuid())}: building without root maps 65536 users; "
+            "add one with `sudo usermod --add-subuids 100000-165535 --add-subgids 100000-165535 $USER`, "
+            "or build as root with `sudo make image …`"
+        )
+    return UserError(
+        f"this computer refuses a mount namespace: {stderr.strip()}; build as root with `sudo make image …`"
+    )
+
+
+def prefix(*more: str, root: bool | None = None) -> list[str]:
+    """The command that puts what follows it into namespaces; for ordinary users with a mapping of users.
+
+    `more` are further options of unshare(1); `root` says who runs the command, where that is somebody else.
+    """
+    root = os.geteuid() == 0 if root is None else root
+    mapping = [] if root else ["--map-auto", "--map-root-user"]
+    # The stage must not outlive the builder, even one that was killed.
+    options = [*mapping, "--mount", "--pid", "--fork", "--kill-child", *more]
+    return ["setpriv", "--pdeathsig", "KILL", "unshare", *options, "--"]
+
+
+def check() -> None:
+    """Refuse early, with the remedy, where the host does not allow namespaces.
+
+    unshare(1) forks a child that maps users, and leaves it waiting for ever when the kernel refuses: so not the end of
+    what they write is awaited, but that of the program itself, and the rest of its group is killed.
+    """
+    argv = [*prefix(), "mount", "-t", "tmpfs", "none", "/mnt"]
+    with tempfile.TemporaryFile("w+") as said:
+        probe = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=said, stderr=said, process_group=0)
+        try:
+            os.waitid(os.P_PID, probe.pid, os.WEXITED | os.WNOWAIT)  # its number stays the group's until it is reaped
+        finally:
+            os.killpg(probe.pid, signal.SIGKILL)
+            status = probe.wait()
+        said.seek(0)
+        if status:
+            raise _refusal(said.read())
+
+
+def moved_clock() -> dict[str, str]:
+    """libfaketime's variables, where `make verify` moves this build's clock; they must reach every program of it.
+
+    All but the one by which programs share a semaphore: that may be of another user, root directory or word size.
+    """
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if (name in ("LD_PRELOAD", "NO_FAKE_STAT") or name.startswith("FAKETIME")) and name != "FAKETIME_SHARED"
+    }
+
+
+def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
+    """Run `python -m module arguments` in namespaces, as `run_logged` does."""
+    argv = [*prefix(), sys.executable, "-m", module, *arguments]
+    environment = {
+        "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
+        "LC_ALL": "C.UTF-8",
+        "TZ": "UTC",
+        "PYTHONPATH": str(paths.PROJECT),
+    }
+    environment |= {name: os.environ[name] for name in ("BUILD", "V") if name in os.environ} | moved_clock()
+    run_logged(module, argv, log, environment)
+
+
+def run_logged(title: str, argv: Sequence[str], log: Path, environment: Mapping[str, str] = os.environ) -> None:
+    """Run a command that ends with the builder; its output goes to `log`, whose end is shown on failure."""
+    progress.command(argv)
+    with log.open("wb") as output:
+        process = subprocess.Popen(argv, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+        try:
+            status = process.wait()
+        finally:
+            process.kill()
+    if status != 0:
+        tail = "\n".join(log.read_text(errors="replace").splitlines()[-30:])
+        raise UserError(f"{title} failed (status {status}); the end of {paths.shown(log)}:\n{tail}")

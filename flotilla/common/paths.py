@@ -1,0 +1,44 @@
+"""Where things lie. Every other module asks here; `BUILD`, `KEYS` and `APPS` come from the environment."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+PROJECT = Path(__file__).resolve().parents[2]
+BUILD = Path(os.environ.get("BUILD") or PROJECT / "build").resolve()
+"""All outputs. Removing it loses nothing that cannot be made again."""
+KEYS = Path(os.environ.get("KEYS") or PROJECT / "ansible" / "keys").resolve()
+"""Private keys: made once, never in git, never removed by `make clean`."""
+
+POOL = BUILD / "pool"
+"""Debian packages by SHA-256, shared by all boards."""
+CACHE = BUILD / "cache"
+"""Results of build steps, named by the hash of what went into them."""
+IMAGES = BUILD / "images"
+"""Card images with what belongs to them."""
+BUNDLES = BUILD / "bundles"
+"""Update bundles, `BOARD.bundle`."""
+GUESTS = BUILD / "fleet" / "guests.yml"
+"""Ansible's inventory of the virtual fleet, while it runs."""
+
+INVENTORY = PROJECT / "ansible" / "inventory"
+TASKS = PROJECT / "ansible" / "control_tasks"
+"""Control tasks that the inventory gives to robots."""
+MESSAGES = "messages.yml"
+"""The file there that is no task: what tasks send each other and the stations."""
+APPS = Path(os.environ.get("APPS") or PROJECT / "apps").resolve()
+"""Apps of one's own, a directory each: those that the inventory names."""
+OVERLAY = PROJECT / "rootfs_overlay"
+PACKAGES = PROJECT / "images" / "packages"
+LOCKS = PROJECT / "images" / "locks"
+KERNELS = PROJECT / "kernel"
+"""Kernels of our own: a file each, and `fragments/` that they are made of."""
+
+
+def shown(path: Path) -> str:
+    """The path as a message should show it: relative to the project where it lies inside."""
+    try:
+        return str(path.relative_to(PROJECT))
+    except ValueError:
+        return str(path)

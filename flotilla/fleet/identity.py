@@ -1,0 +1,211 @@
+"""What makes a card robot 3: the templates of rootfs_overlay/ rendered for it, and its keys.
+
+Keys are made once, when first needed, and kept in `paths.KEYS`: an SSH host key per robot, pinned everywhere, and the
+operator's key, which every robot admits.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import apps, interfaces, transport
+from flotilla.fleet.apps import BuiltApp
+from flotilla.fleet.model import Fleet, Host, Robot
+
+if TYPE_CHECKING:
+    import jinja2
+
+TASKS = PurePosixPath("/etc/flotilla/tasks")
+"""Where a robot's control tasks lie on it."""
+_CAN = PurePosixPath("etc/systemd/network/20-can.network.j2")
+"""Rendered for each CAN interface of the robot, with its name in the file's."""
+_PRIVATE = {"ssh_host_ed25519_key.j2": 0o600}
+"""Modes of templates whose result is not for everyone."""
+
+
+def key(name: str, comment: str) -> Path:
+    """The private key `name`, made if there is none."""
+    path = paths.KEYS / name
+    if not path.exists():
+        paths.KEYS.mkdir(parents=True, exist_ok=True, mode=0o700)
+        beside = path.with_name(f".{name}.new")
+        beside.unlink(missing_ok=True)
+        argv = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", comment, "-f", str(beside)]
+        try:
+            subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+        except subprocess.CalledProcessError as error:
+            raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
+        beside.with_name(beside.name + ".pub").rename(path.with_name(name + ".pub"))
+        beside.rename(path)
+    return path
+
+
+def public_key(private: Path) -> str:
+    """The public half, without its comment."""
+    return " ".join(private.with_name(private.name + ".pub").read_text().split()[:2])
+
+
+def host_keys(fleet: Fleet) -> dict[str, str]:
+    """Public host key of every robot by name; makes what is missing, and the `known_hosts` that pins them."""
+    robots = sorted(fleet.robots.values(), key=lambda robot: robot.number)
+    keys = {robot.name: public_key(key(f"{robot.name}_ed25519", robot.name)) for robot in robots}
+    accepted = [(robot, keys[robot.name]) for robot in robots]
+    accepted += [(robot, _retired(robot).read_text().strip()) for robot in robots if _retired(robot).exists()]
+    pinned = "".join(f"{robot.name},{robot.address} {key}\n" for robot, key in accepted)
+    known = paths.KEYS / "known_hosts"
+    if not known.exists() or known.read_text() != pinned:
+        beside = known.with_name(f".known_hosts.{os.getpid()}")
+        beside.write_text(pinned)
+        beside.rename(known)
+    return keys
+
+
+def _retired(robot: Robot) -> Path:
+    """The public host key that a robot may still have, while its new one is on the way."""
+    return paths.KEYS / f"{robot.name}_ed25519.retired"
+
+
+def rotate_host_key(fleet: Fleet, robot: Robot) -> None:
+    """Give a robot a new host key. The old one is accepted on this computer until `retire_host_key`."""
+    private = paths.KEYS / f"{robot.name}_ed25519"
+    _retired(robot).write_text(host_keys(fleet)[robot.name] + "\n")
+    for file in (private, private.with_name(private.name + ".pub")):
+        file.unlink()
+    host_keys(fleet)
+
+
+def retire_host_key(fleet: Fleet, robot: Robot) -> None:
+    """Accept the old host key of a robot no more."""
+    _retired(robot).unlink(missing_ok=True)
+    host_keys(fleet)
+
+
+def hosts(fleet: Fleet) -> list[Host]:
+    """Everyone with an address, in order of address."""
+    return sorted([*fleet.robots.values(), *fleet.stations], key=lambda host: host.address)
+
+
+def _first_dds_port(fleet: Fleet) -> int:
+    """The first of the 250 that a domain has (DDSI-RTPS 2.1, 9.6.1)."""
+    return 7400 + 250 * fleet.network.dds_domain
+
+
+def dds_peers(fleet: Fleet, robot: Robot) -> list[str]:
+    """Where a robot's DDS programs look for others: at all its own ports, and at `address:port` of each other robot's
+    control tasks and of one program more.
+
+    Programs of a computer take the first port that is free, whichever they are.
+    """
+    others = sorted((other for other in fleet.robots.values() if other != robot), key=lambda other: other.address)
+    first = _first_dds_port(fleet) + 10
+    ports = [f"{other.address}:{first + 2 * n}" for other in others for n in range(len(other.control_tasks) + 1)]
+    return [str(robot.address), *ports]
+
+
+def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
+    """What control tasks may use, besides `message` of transport.py."""
+    board = fleet.boards[robot.board]
+    return {"fleet": fleet, "network": fleet.network, "robot": robot, "board": board, "addresses": transport.addresses}
+
+
+def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
+    """What the templates may use."""
+    keys = host_keys(fleet)
+    first = _first_dds_port(fleet)
+    return _description(fleet, robot) | {
+        "hosts": hosts(fleet),
+        "interface": fleet.interface(robot),
+        "dds_ports": f"{first}-{first + 249}",
+        "dds_peers": dds_peers(fleet, robot),
+        "host_keys": keys,
+        "host_public_key": keys[robot.name],
+        "host_private_key": (paths.KEYS / f"{robot.name}_ed25519").read_text(),
+        "operator_key": public_key(key("operator_ed25519", "operator")),
+        # Stable, and not to be guessed back to anything (machine-id(5)).
+        "machine_id": hashlib.sha256(f"machine-id {keys[robot.name]}".encode()).hexdigest()[:32],
+    }
+
+
+@functools.cache
+def _environment() -> jinja2.Environment:
+    import jinja2  # here, because it takes a while, in which the build has other things to do
+
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader([paths.OVERLAY, paths.TASKS]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+
+
+def render(fleet: Fleet, robot: Robot, built: Sequence[BuiltApp] = ()) -> dict[PurePosixPath, tuple[bytes, int]]:
+    """The robot's files by path on the robot: content and mode. An empty result means no file.
+
+    `built`: the robot's apps, each of them.
+    """
+    import jinja2
+
+    if [app.name for app in built] != robot.apps:  # a defect of the caller's: a card would lack them without a word
+        raise ValueError(f"{robot.name} has the apps {robot.apps}, not {[app.name for app in built]}")
+
+    values = variables(fleet, robot)
+    files = {}
+    for template in sorted(paths.OVERLAY.rglob("*.j2")):
+        name = PurePosixPath(template.relative_to(paths.OVERLAY))
+        each: dict[PurePosixPath, dict[str, object]] = {name.with_suffix(""): {}}
+        if name == _CAN:
+            each = {_CAN.with_name(f"20-{can}.network"): {"can": can, "bus": bus} for can, bus in robot.can.items()}
+        for path, further in each.items():
+            try:
+                content = _environment().get_template(str(name)).render(values | further).encode()
+            except jinja2.TemplateError as error:
+                raise UserError(f"{paths.shown(template)}: {error}") from error
+            if content.strip():
+                files[PurePosixPath("/") / path] = (content, _PRIVATE.get(template.name, 0o644))
+    files |= {TASKS / f"{name}.yml": (task, 0o644) for name, task in control_tasks(fleet, robot).items()}
+    return files | apps.listings(built)
+
+
+def control_tasks(fleet: Fleet, robot: Robot) -> dict[str, bytes]:
+    """The robot's control tasks by name. Without keys: whoever only reads a description pins nothing."""
+    values = _description(fleet, robot)
+    message = functools.partial(transport.hop, fleet, robot)
+    tasks = {name: _task(name, values | {"message": functools.partial(message, name)}) for name in robot.control_tasks}
+    problems = []
+    for name, task in tasks.items():
+        description = _parsed(task)
+        found = [*interfaces.problems(description, fleet, robot), *transport.problems(fleet, name, description)]
+        problems += [f"{paths.shown(paths.TASKS / f'{name}.yml')}: {problem}" for problem in found]
+    if problems:
+        raise UserError("\n".join(problems))
+    return tasks
+
+
+def _task(name: str, values: dict[str, object]) -> bytes:
+    import jinja2
+
+    file = paths.TASKS / f"{name}.yml"
+    try:
+        return _environment().from_string(file.read_text(encoding="utf-8")).render(values).encode()
+    except (jinja2.TemplateError, OSError, UserError) as error:
+        raise UserError(f"{paths.shown(file)}: {error}") from error
+
+
+def _parsed(task: bytes) -> object:
+    """None if it is no YAML, which is the runtime's to say."""
+    import yaml  # here, because robots without control tasks need none
+
+    try:
+        return yaml.safe_load(task)
+    except yaml.YAMLError:
+        return None

@@ -1,0 +1,47 @@
+"""Whether a robot has the network interfaces and addresses that its control tasks name: blocks wait for those."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from flotilla.fleet.model import Fleet, Robot
+
+_CAN_BLOCKS = ("can-receive", "can-send", "epos2")
+"""Blocks on a CAN interface, `can0` unless they say another."""
+_UDP_BLOCKS = ("udp-receive", "udp-send")
+"""Blocks on any interface unless they name one."""
+
+
+def problems(description: object, fleet: Fleet, robot: Robot) -> Iterator[str]:
+    """What is wrong with the interfaces of a control task, rendered and parsed, each with block, value and remedy.
+
+    What is no task in other ways is the runtime's to say.
+    """
+    blocks = description.get("blocks") if isinstance(description, dict) else None
+    for name, block in blocks.items() if isinstance(blocks, dict) else ():
+        kind = block.get("type") if isinstance(block, dict) else None
+        if kind not in (*_CAN_BLOCKS, *_UDP_BLOCKS):
+            continue
+        parameters = block.get("parameters")
+        told = parameters.get("interface") if isinstance(parameters, dict) else None
+        if kind in _CAN_BLOCKS:
+            used = told or "can0"
+            if used not in robot.can:
+                others = f"{' or '.join(robot.can)}, or " if robot.can else ""
+                yield (
+                    f"blocks.{name}.parameters.interface: {robot.name} has no CAN interface {used}; "
+                    f"{others}add {used} with its bitrate to can: of {robot.name} in robots.yml"
+                )
+            continue
+        own = fleet.interface(robot)
+        if told and told not in (own, "lo"):
+            yield (
+                f"blocks.{name}.parameters.interface: {robot.name} has no address on {told}; "
+                f"{own}, lo, or leave it out for any"
+            )
+        local = parameters.get("local_address") if isinstance(parameters, dict) else None
+        if local and local not in (str(robot.address), "127.0.0.1", "0.0.0.0"):
+            yield (
+                f"blocks.{name}.parameters.local_address: {local} is not {robot.name}'s; "
+                f"{robot.address}, 127.0.0.1, or leave it out for any"
+            )

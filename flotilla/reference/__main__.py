@@ -1,0 +1,9 @@
+"""`make reference`: writes the pages."""
+
+from flotilla.common import paths
+from flotilla.reference.pages import FOLDER, PAGES, RUNTIME_PAGES
+
+for name, page in PAGES.items():
+    (FOLDER / name).write_text(page(), encoding="utf-8")
+for name, runtime_page in RUNTIME_PAGES.items():
+    (FOLDER / name).write_text(runtime_page(paths.BUILD / "runtime"), encoding="utf-8")

@@ -1,0 +1,33 @@
+"""`make provision`: runs a playbook of `ansible/` on robots, or on the guests of the virtual fleet."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flotilla.common import paths, progress
+from flotilla.common.errors import UserError
+
+ANSIBLE = paths.PROJECT / "ansible"
+
+
+def play(playbook: str, *, robot: int | None, guests: bool, words: Sequence[str]) -> None:
+    """Become `ansible-playbook`. Without `guests` the virtual fleet is out of reach, and with it the robots are."""
+    file = ANSIBLE / f"{playbook}.yml"
+    if not file.is_file():
+        there = ", ".join(sorted(path.stem for path in ANSIBLE.glob("*.yml") if path.stem != "files"))
+        raise UserError(f"{playbook}: ansible/ has no such playbook; there are {there}")
+    if guests and not paths.GUESTS.exists():
+        raise UserError(f"{paths.shown(paths.GUESTS)} is missing: no virtual fleet runs; start one: make fleet N=4")
+    programs = Path(sys.executable).parent
+    argv = [str(programs / "ansible-playbook"), "-i", "inventory"]
+    argv += ["-i", str(paths.GUESTS)] if guests else []
+    if limit := f"robot{robot}" if robot is not None else "guests" if guests else "":
+        argv += ["-l", limit]
+    argv += [*words, file.name]
+    progress.command(argv)
+    os.chdir(ANSIBLE)
+    os.environ |= {"PATH": f"{programs}:{os.environ['PATH']}", "BUILD": str(paths.BUILD), "KEYS": str(paths.KEYS)}
+    os.execv(argv[0], argv)

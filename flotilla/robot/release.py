@@ -1,0 +1,102 @@
+"""Releases, from the station's side: what a bundle holds, which chunks a robot lacks, and what a robot should run.
+
+A bundle is made by `images/builder/bundle.py`. The robot's side is `/usr/lib/flotilla/update.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import tarfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Robot
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """An update bundle, opened."""
+
+    path: Path
+    manifest: str
+    """The text that is signed."""
+    signatures: tuple[str, ...]
+    start: int
+    """Where the slot's content lies in the file."""
+
+    @property
+    def header(self) -> dict[str, str]:
+        """What the slot's header will say."""
+        header: dict[str, str] = json.loads(self.manifest)["header"]
+        return header
+
+    @property
+    def offer(self) -> bytes:
+        """What the robot's `begin` reads."""
+        return json.dumps({"manifest": self.manifest, "signatures": self.signatures}).encode()
+
+    def extract(self, to: Path) -> None:
+        """Write the slot's content to a file."""
+        with self.path.open("rb") as file, to.open("wb") as out:
+            file.seek(self.start)
+            left = int(self.header["BYTES"])
+            while left:
+                left -= out.write(file.read(min(left, 1 << 20)))
+
+    def chunks(self, numbers: Sequence[int], batch_bytes: int) -> Iterator[bytes]:
+        """These chunks as the robot's `write` reads them, about `batch_bytes` at a time."""
+        described = json.loads(self.manifest)
+        length = described["chunk_bytes"]
+        size = int(described["header"]["BYTES"])
+        batch = b""
+        with self.path.open("rb") as file:
+            for number in numbers:
+                file.seek(self.start + number * length)
+                content = file.read(min(length, size - number * length))
+                batch += struct.pack("<II", number, len(content)) + content
+                if len(batch) >= batch_bytes:
+                    yield batch
+                    batch = b""
+        if batch:
+            yield batch
+
+
+def read(path: Path) -> Bundle:
+    """The bundle in a file. Who signed it, robots find out."""
+    try:
+        with tarfile.open(path, "r:") as archive:
+            members = {member.name: member for member in archive}
+            content = members["slot.img"]
+            texts = {
+                name: (archive.extractfile(member) or archive).read().decode()  # type: ignore[union-attr]
+                for name, member in members.items()
+                if name.startswith("manifest.json")
+            }
+    except FileNotFoundError:
+        raise UserError(f"{paths.shown(path)} is missing; make it: `make bundle BOARD={path.stem}`") from None
+    except (KeyError, tarfile.TarError, UnicodeDecodeError) as error:
+        raise UserError(f"{paths.shown(path)} is no bundle: {error!r}; make it again: `make bundle`") from error
+    signatures = tuple(text for name, text in sorted(texts.items()) if name.endswith(".sig"))
+    bundle = Bundle(path, texts["manifest.json"], signatures, content.offset_data)
+    if content.size != int(bundle.header["BYTES"]):
+        raise UserError(f"{paths.shown(path)} is cut off; make it again: `make bundle BOARD={path.stem}`")
+    return bundle
+
+
+def delta_of(base: str, content: str) -> Path:
+    """Where the delta lies that makes one slot's content of another; both by their SHA-256."""
+    return paths.BUNDLES / "deltas" / f"{base[:16]}-{content[:16]}"
+
+
+def wanted(robot: Robot) -> str | None:
+    """SHA-256 of what the running slot of a robot holds if its release is that of its image here; None without one."""
+    try:
+        told: dict[str, Any] = json.loads((paths.IMAGES / f"{robot.name}.manifest.json").read_bytes())
+        return next((part["sha256"] for part in told["parts"] if part["name"] == "slot.img"), None)
+    except FileNotFoundError:
+        return None

@@ -1,0 +1,75 @@
+"""Serves what robots tell the station while they tell it, by Foxglove's WebSocket protocol (subprotocol
+foxglove.sdk.v1, github.com/foxglove/ws-protocol): Foxglove shows it, and any other client.
+
+Threads of the library send. A client that reads too slowly loses its oldest messages, and disturbs nobody else.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+
+import foxglove
+from foxglove.websocket import ChannelView, Client, ServerListener
+
+from flotilla.common.errors import UserError
+from flotilla.station import schema
+from flotilla.station.recording import Value
+from flotilla.station.telemetry import Stream
+
+PORT = 8765
+"""Where Foxglove looks first."""
+
+
+class _Listener(ServerListener):
+    """Called by the library's threads."""
+
+    def __init__(self) -> None:
+        self.clients: set[int] = set()
+        """Those that ever subscribed."""
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        self.clients.add(client.id)
+
+
+class Server:
+    """Serves the messages of `known` at an address of this computer; a sink of the receiver. `port` 0: any."""
+
+    def __init__(self, known: Iterable[Stream], address: str, port: int) -> None:
+        if not 0 <= port < 1 << 16:
+            raise UserError(f"TCP port {port}: there is none; give one from 1 to 65535: PORT=")
+        self._context = foxglove.Context()  # which channels and server do not hold on to
+        self._listener = _Listener()
+        self._served = 0
+        self._channels: dict[str, tuple[foxglove.Channel, schema.Schema]] = {}
+        for stream in known:
+            own = schema.Schema(stream)
+            described = foxglove.Schema(name=own.name, encoding=schema.ENCODING, data=own.data)
+            channel = foxglove.Channel(
+                stream.topic, schema=described, message_encoding=schema.ENCODING, context=self._context
+            )
+            self._channels[stream.topic] = (channel, own)
+        try:
+            self._server = foxglove.start_server(
+                name="flotilla", host=address, port=port, server_listener=self._listener, context=self._context
+            )
+        except RuntimeError as error:
+            reason = str(error).removeprefix("FoxgloveError: Failed to bind port: ")
+            remedy = "give another port or address of this computer: PORT= ADDRESS="
+            raise UserError(f"TCP port {port} of {address}: {reason}; {remedy}") from error
+        self._url = f"ws://{address}:{self._server.port}"
+        sys.stderr.write(f"serving at {self._url}; in Foxglove: Open connection, Foxglove WebSocket\n")
+        sys.stderr.flush()
+
+    def take(self, stream: Stream, values: Mapping[str, Value], received_ns: int) -> None:
+        channel, own = self._channels[stream.topic]
+        if channel.has_sinks():
+            channel.log(own.encode(values), log_time=received_ns)
+            self._served += 1
+
+    def refresh(self) -> None:
+        """Nothing to do: every message leaves at once."""
+
+    def end(self) -> str:
+        self._server.stop()
+        return f"{self._url}: {self._served} messages served, {len(self._listener.clients)} clients"

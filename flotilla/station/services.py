@@ -1,0 +1,136 @@
+"""Whether control tasks run, and how: asked of each robot by ssh every ASK_S, over one connection that stays."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import threading
+import time
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from flotilla.common.errors import UserError
+from flotilla.common.processes import DIE_WITH_PARENT
+from flotilla.fleet.model import Robot
+from flotilla.robot import ssh
+
+ASK_S = 5
+_END = "."
+_PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
+_SETTINGS = ("ConnectTimeout=5", "ServerAliveInterval=5", "ServerAliveCountMax=2")
+
+
+@dataclass(frozen=True)
+class TaskStatus:
+    """By the running task itself; runtime/executive/status.h."""
+
+    period_s: float
+    overruns: int
+    """Since it was started."""
+    lately: int
+    """Of them, those since it was asked before."""
+    flags: dict[str, bool]
+    """Of its sensors."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Of a control task's service."""
+
+    words: str
+    """`running 75 s`, `failed`: the service manager's, and since when."""
+    good: bool
+    """It runs, and has done so since it was started."""
+    status: TaskStatus | None = None
+    """None: it does not run."""
+
+
+def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
+    """Its tasks by name, again and again, until UserError says why it does not answer any more."""
+    units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
+    longest = 1 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
+    show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
+    tell = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
+    script = f"while cat /proc/uptime && {show} && {{ {tell}; }} && echo {_END}; do sleep {ASK_S}; done"
+    before: dict[str, State] = {}
+    program, *way = ssh.command(robot)
+    options = [word for setting in _SETTINGS for word in ("-o", setting)]
+    argv = [*DIE_WITH_PARENT, program, *options, *way, shlex.join(["sudo", "sh", "-c", script])]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True) as process:
+        try:
+            assert process.stdout
+            assert process.stderr
+            lines: list[str] = []
+            for line in process.stdout:
+                if line.rstrip() != _END and len(lines) < longest:
+                    lines.append(line)
+                    continue
+                try:
+                    before = _states(lines[: -len(units)], lines[-len(units) :], before)
+                    yield before
+                except (ValueError, KeyError, TypeError) as error:
+                    raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {error!r}") from error
+                lines = []
+            raise ssh.no_answer(robot, process.stderr.read().strip() or "the connection broke")
+        finally:
+            process.kill()
+
+
+def _states(said: list[str], reported: list[str], before: dict[str, State]) -> dict[str, State]:
+    """What one round says: /proc/uptime, then the services, an empty line between them; and the tasks, a line each."""
+    uptime, _, shown = "".join(said).partition("\n")
+    reports = {report["task"]: report for report in map(json.loads, reported) if report}
+    found = {}
+    for block in shown.strip().split("\n\n"):
+        unit = dict(line.split("=", 1) for line in block.splitlines())
+        task = unit["Id"].removeprefix("flotilla-task@").removesuffix(".service")
+        active = unit["ActiveState"] == "active"
+        since_s = float(uptime.split()[0]) - int(unit["ActiveEnterTimestampMonotonic"]) / 1e6
+        restarts = int(unit["NRestarts"])
+        words = (
+            unit["SubState"]
+            + (f" {since_s:.0f} s" if active else "")
+            + (f", restarted {restarts}×" if restarts else "")
+        )
+        past = before[task].status if task in before else None
+        found[task] = State(
+            words, active and not restarts, _status_of(reports[task], past) if task in reports else None
+        )
+    return found
+
+
+def _status_of(report: dict[str, Any], past: TaskStatus | None) -> TaskStatus:
+    overruns = int(report["overruns"])
+    counted = past.overruns if past else overruns
+    return TaskStatus(
+        period_s=float(report["period_s"]),
+        overruns=overruns,
+        lately=overruns - (counted if counted <= overruns else 0),  # it was started anew
+        flags={name: bool(sensor["flag"]) for name, sensor in report["sensors"].items()},
+    )
+
+
+class Services:
+    """Asks robots that have control tasks, by a thread each, which ends with the process. UserError without keys."""
+
+    def __init__(self, robots: Iterable[Robot]) -> None:
+        asked = [robot for robot in robots if robot.control_tasks]
+        self.states = {(robot.name, task): State("asked", True) for robot in asked for task in robot.control_tasks}
+        """By robot and task, as they were reported last."""
+        for robot in asked:
+            ssh.command(robot)
+            threading.Thread(target=self._follow, args=(robot,), daemon=True).start()
+
+    def _follow(self, robot: Robot) -> None:
+        while True:
+            try:
+                for states in ask(robot):
+                    for task, state in states.items():
+                        self.states[robot.name, task] = state
+            except UserError:
+                for task in robot.control_tasks:
+                    self.states[robot.name, task] = State("no answer", False)
+            time.sleep(ASK_S)

@@ -1,0 +1,144 @@
+"""The update bundle of a board, which brings its release to robots in service: a tar file, reproducible.
+
+| member | what |
+|---|---|
+| manifest.json | format, header of the slot, and the SHA-256 of each chunk of slot.img; robots judge a release by it |
+| manifest.json.NAME.sig | its signature by the key NAME (`ssh-keygen -Y sign`) |
+| sbom.spdx.json, sbom.cdx.json | bills of materials |
+| slot.img | root, kernel, initramfs and release keys: all that a slot holds but the header |
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import subprocess
+import tarfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from flotilla.common import cache, host, namespace, paths, progress
+from flotilla.common.errors import UserError
+from flotilla.fleet import release_keys
+from flotilla.fleet.model import Board, Fleet, Releases
+from images.builder import manifest, slot
+from images.builder.build import board_build
+
+FORMAT = 1
+CHUNK_BYTES = 1 << 18
+"""A robot reads, checks and writes so much at a time, and what was cut off begins anew there."""
+
+
+def file_of(board: str) -> Path:
+    """Where the bundle of a board lies."""
+    return paths.BUNDLES / f"{board}.bundle"
+
+
+def make(fleet: Fleet, board: Board, signatures: Sequence[Path]) -> Path:
+    """Make the bundle of a board, signed by the keys that are here and by `signatures` made elsewhere."""
+    host.check()
+    namespace.check()
+    started = time.monotonic()
+    final = file_of(board.name)
+    with cache.exclusive():
+        made = board_build(board, fleet.releases)
+        bills = {f"sbom.{end}": (made.manifest / f"sbom.{end}").read_bytes() for end in manifest.SBOMS}
+        signed = pack(final, made.slot, fleet.releases, bills, made.lock.epoch, signatures)
+    print(
+        f"{paths.shown(final)}: release {slot.release().release} of {board.name}, "
+        f"{progress.size(final.stat().st_size)}, signed by {', '.join(signed)}, {time.monotonic() - started:.1f} s"
+    )
+    return final
+
+
+def pack(
+    final: Path,
+    content: Path,
+    releases: Releases,
+    bills: Mapping[str, bytes],
+    epoch: int,
+    signatures: Sequence[Path] = (),
+) -> list[str]:
+    """Write the bundle of what `slot.build` made in `content`; who has signed it. `bills`: further members.
+
+    The manifest is left beside it, for those who sign elsewhere.
+    """
+    final.parent.mkdir(parents=True, exist_ok=True)
+    described = manifest_of(content)
+    text = final.with_suffix(".manifest.json")
+    text.write_bytes(described)
+    signed = _signatures(text, releases, signatures)
+    members = {"manifest.json": described}
+    members |= {f"manifest.json.{name}.sig": signed[name] for name in sorted(signed)} | dict(bills)
+    new = final.with_suffix(".new")
+    with tarfile.open(new, "w", format=tarfile.USTAR_FORMAT) as archive:
+        for name, each in members.items():
+            _add(archive, name, io.BytesIO(each), len(each), epoch)
+        with (content / "slot.img").open("rb") as blob:
+            _add(archive, "slot.img", blob, (content / "slot.img").stat().st_size, epoch)
+    new.rename(final)
+    return sorted(signed)
+
+
+def manifest_of(content: Path) -> bytes:
+    """The manifest of what `slot.build` made."""
+    chunks = []
+    with (content / "slot.img").open("rb") as blob:
+        while chunk := blob.read(CHUNK_BYTES):
+            chunks.append(hashlib.sha256(chunk).hexdigest())
+    header = json.loads((content / "header.json").read_text())
+    described = {"format": FORMAT, "header": header, "chunk_bytes": CHUNK_BYTES, "chunks": chunks}
+    return (json.dumps(described, indent=1) + "\n").encode()
+
+
+def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> dict[str, bytes]:
+    """Signatures of a manifest by name of the key: enough of them, each checked."""
+    trusted = json.loads(release_keys.document(releases))
+    signed: dict[str, bytes] = {}
+    for key in trusted["keys"]:
+        private = paths.KEYS / f"{key['name']}_ed25519"
+        if private.exists():
+            argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", release_keys.NAMESPACE, "-f", str(private)]
+            signed[key["name"]] = _ran(argv, text.read_bytes())
+    for file in elsewhere:
+        name = next((key["name"] for key in trusted["keys"] if _signed_by(text, file, key)), None)
+        if name is None:
+            raise UserError(
+                f"{file}: is no signature of {paths.shown(text)} by a key of releases in group_vars/all.yml; make it "
+                f"by `ssh-keygen -Y sign -n {release_keys.NAMESPACE} -f KEY {text.name}`"
+            )
+        signed[name] = file.read_bytes()
+    if len(signed) < trusted["signatures"]:
+        names = ", ".join(key["name"] for key in trusted["keys"])
+        raise UserError(
+            f"{paths.shown(text)}: {len(signed)} of {trusted['signatures']} signatures; have more of {names} sign it: "
+            f"`ssh-keygen -Y sign -n {release_keys.NAMESPACE} -f KEY {text.name}`, then say what that makes: "
+            'SIGNATURES="FILE ..."'
+        )
+    return signed
+
+
+def _signed_by(text: Path, signature: Path, key: dict[str, str]) -> bool:
+    allowed = text.with_suffix(".allowed")
+    allowed.write_text(f'{key["name"]} namespaces="{release_keys.NAMESPACE}" {key["key"]}\n')
+    argv = ["ssh-keygen", "-Y", "verify", "-f", str(allowed), "-I", key["name"], "-n", release_keys.NAMESPACE]
+    argv += ["-s", str(signature)]
+    try:
+        return subprocess.run(argv, input=text.read_bytes(), capture_output=True, check=False).returncode == 0
+    finally:
+        allowed.unlink()
+
+
+def _ran(argv: list[str], content: bytes) -> bytes:
+    done = subprocess.run(argv, input=content, capture_output=True, check=False)
+    if done.returncode:
+        raise UserError(f"{' '.join(argv)} failed: {done.stderr.decode(errors='replace').strip()}")
+    return done.stdout
+
+
+def _add(archive: tarfile.TarFile, name: str, content: io.BufferedIOBase, size: int, epoch: int) -> None:
+    member = tarfile.TarInfo(name)
+    member.size, member.mtime = size, epoch
+    archive.addfile(member, content)

@@ -1,0 +1,138 @@
+"""The commands of the lab: `flotilla boot`, `fleet`, `latency`, `scenarios` and others."""
+
+from __future__ import annotations
+
+import argparse
+
+from flotilla.cli.command import Command, robot_argument
+
+
+def _boot(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from images.builder import build
+    from lab.qemu import boot
+
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    station = fleet.stations[0].address if fleet.stations else None
+    boot.boot(robot, fleet.boards[robot.board], fleet.network, build.image_of(robot), station=station)
+
+
+def _fleet(arguments: argparse.Namespace) -> None:
+    from lab.qemu import virtual_fleet
+
+    virtual_fleet.run(arguments)
+
+
+def _fleet_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.qemu import virtual_fleet
+
+    virtual_fleet.arguments(parser)
+
+
+def _fleet_scale(arguments: argparse.Namespace) -> None:
+    from lab.containers import scale
+
+    scale.run(arguments)
+
+
+def _fleet_scale_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.containers import scale
+
+    scale.arguments(parser)
+
+
+def _latency(arguments: argparse.Namespace) -> None:
+    from lab.latency import command
+
+    command.latency(arguments)
+
+
+def _latency_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.latency import command
+
+    command.latency_arguments(parser)
+
+
+def _latency_accept(arguments: argparse.Namespace) -> None:
+    from lab.latency import command
+
+    command.accept(arguments)
+
+
+def _latency_accept_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.latency import command
+
+    command.accept_arguments(parser)
+
+
+def _boot_time(arguments: argparse.Namespace) -> None:
+    from lab.latency import command
+
+    command.boot_time(arguments)
+
+
+def _boot_time_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.latency import command
+
+    command.system_arguments(parser)
+
+
+def _scenarios(arguments: argparse.Namespace) -> None:
+    from lab.scenarios import command
+
+    command.run(arguments)
+
+
+def _scenarios_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.scenarios import command
+
+    command.arguments(parser)
+
+
+def _scenarios_accept(arguments: argparse.Namespace) -> None:
+    from lab.scenarios import command
+
+    command.accept(arguments)
+
+
+def _emulate(arguments: argparse.Namespace) -> None:
+    from lab.emulators import command
+
+    command.run(arguments)
+
+
+def _emulate_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.emulators import command
+
+    command.arguments(parser)
+
+
+def _power_cuts(arguments: argparse.Namespace) -> None:
+    from lab.power_cuts import command
+
+    command.run(arguments)
+
+
+def _power_cuts_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.power_cuts import command
+
+    command.arguments(parser)
+
+
+COMMANDS = (
+    Command("Lab", "boot", "boot a robot's image in QEMU on this terminal", _boot, robot_argument),
+    Command("Lab", "fleet", "start, show or end a virtual fleet of guests", _fleet, _fleet_arguments),
+    Command("Lab", "fleet-scale", "measure how provisioning grows with the fleet", _fleet_scale,
+            _fleet_scale_arguments),
+    Command("Lab", "emulate", "emulate a serial device until interrupted", _emulate, _emulate_arguments),
+    Command("Lab", "latency", "measure latency in virtual time and judge it", _latency, _latency_arguments),
+    Command("Lab", "latency-accept", "measure, and make that the accepted latency", _latency_accept,
+            _latency_accept_arguments),
+    Command("Lab", "boot-time", "show where a boot spends its time", _boot_time, _boot_time_arguments),
+    Command("Lab", "scenarios", "fly a robot by four computers and write the report", _scenarios,
+            _scenarios_arguments),
+    Command("Lab", "scenarios-accept", "fly as the tests do, and accept the latencies of the hops", _scenarios_accept),
+    Command("Lab", "power-cuts", "replay every power cut of an update, and judge what starts", _power_cuts,
+            _power_cuts_arguments),
+)  # fmt: skip

@@ -1,0 +1,355 @@
+#!/usr/bin/python3
+"""Brings a release into the slot that does not run: checks it, writes it, reads it back. One command at a time.
+
+  begin     standard input: {"manifest": TEXT, "signatures": [TEXT, ...]}; the release is taken if it is signed as the
+            running one asks, made for this board and card, and not below the running one's floor. It stays known until
+            another one begins.
+  copy      take what the running release has in the same place
+  write     standard input: chunks, each behind its number and length (two unsigned 32-bit numbers, little-endian)
+  delta     standard input: a delta from the running release's content, as flotilla-patch reads it
+  finish    read all back from the card, and write the header: from now on the slot holds the release
+  activate  try it at the next start; the layer above /etc begins as a copy of the running release's
+
+Each prints one object of JSON: `release`, `slot`, `base` (SHA-256 of the running release's content), `running` (the
+release runs already), `staged` (the slot holds it), `missing` (numbers of chunks that the slot does not hold yet),
+`chunk_bytes`, `memory_kib` (the peak so far). Whatever is cut off, by power or by the radio, begins again with `begin`,
+and goes on where it was. Status 1: refused, with the reason on standard error.
+
+The header is cleared before anything else of the slot is written, and written when all of it is on the card
+(images/builder/slot.py). Reads and writes go past the page cache, which belongs to the control tasks. What this module
+imports counts as memory on a robot, so it does without tempfile, shutil, pathlib and ctypes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import mmap
+import os
+import struct
+import subprocess
+import sys
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # without an import: it takes time
+    from collections.abc import Iterator
+    from typing import Any, BinaryIO
+
+KNOWN = "/data/update"
+RUN = "/run"
+LAYERS = "/data"
+FORMAT = 1
+NAMESPACE = "flotilla-release"
+SIGNATURE = b"# GRUB Environment Block\n"
+HEADER_ROOM, HEADER_BYTES = 4096, 1024
+SECTOR = 512
+LARGEST_CHUNK = 1 << 18
+
+
+class Refused(Exception):
+    """A reason, for whoever asked."""
+
+
+def slots() -> dict[str, Any]:
+    """What flotilla-slot says."""
+    found: dict[str, Any] = json.loads(
+        subprocess.run(["flotilla-slot", "show"], check=True, stdout=subprocess.PIPE).stdout
+    )
+    return found
+
+
+class Slot:
+    """A slot of the card this system runs from."""
+
+    def __init__(self, name: str, *, writable: bool = False) -> None:
+        self.name = name
+        self._fd = os.open(disk(), (os.O_RDWR if writable else os.O_RDONLY) | os.O_DIRECT | os.O_CLOEXEC)
+        self._buffer = mmap.mmap(-1, LARGEST_CHUNK)  # direct access needs whole pages
+        os.preadv(self._fd, [memoryview(self._buffer)[:SECTOR]], 0)
+        first, count = struct.unpack_from("<II", self._buffer, 446 + 16 * (1 + "AB".index(name)) + 8)
+        self.start, self.size = first * SECTOR, count * SECTOR
+
+    def read(self, offset: int, length: int) -> memoryview:
+        """Bytes of the slot; good until the next call."""
+        view = memoryview(self._buffer)[:length]
+        if os.preadv(self._fd, [view], self.start + offset) != length:
+            raise Refused(f"slot {self.name}: byte {offset} cannot be read")
+        return view
+
+    def write(self, offset: int, content: bytes) -> None:
+        self._buffer[: len(content)] = content
+        view = memoryview(self._buffer)[: len(content)]
+        if os.pwritev(self._fd, [view], self.start + offset) != len(content):
+            raise Refused(f"slot {self.name}: byte {offset} cannot be written")
+
+    def flush(self) -> None:
+        os.fdatasync(self._fd)
+
+    def header(self) -> dict[str, str]:
+        """What the header says; nothing where there is none."""
+        block = bytes(self.read(self.size - HEADER_ROOM, HEADER_BYTES))
+        if not block.startswith(SIGNATURE):
+            return {}
+        lines = block.decode("ascii", "replace").splitlines()
+        return dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
+
+
+def disk() -> str:
+    """The disk of the running root."""
+    with open("/proc/self/mountinfo") as mounts:
+        roots = [words[2] for words in map(str.split, mounts) if words[4] == "/"]
+    with open(f"/sys/dev/block/{roots[-1]}/uevent") as events:
+        name = dict(line.strip().split("=", 1) for line in events)["DEVNAME"]
+    return "/dev/" + (name[:-2] if name[-3:-1].endswith("p") and name[-3].isdigit() else name[:-1])
+
+
+def partition(slot: str) -> str:
+    """The block device of a slot."""
+    whole = disk()
+    return f"{whole}{'p' if whole[-1].isdigit() else ''}{2 + 'AB'.index(slot)}"
+
+
+class Release:
+    """A release that this robot may take."""
+
+    def __init__(self, text: str, signatures: list[str]) -> None:
+        """Refused unless it is signed as the running release asks, made for this board and card, and not too old."""
+        state = slots()
+        if not state["running"]:
+            raise Refused("this robot was started from no slot")
+        if state["trial"] == state["running"]:
+            raise Refused("the running release is on trial: confirm it first, or let it go back")
+        running = Slot(state["running"])
+        present = running.header()
+        verify(text, signatures, keys_of(running, present))
+        manifest: dict[str, Any] = json.loads(text)
+        if manifest["format"] != FORMAT:
+            raise Refused(f"the release has format {manifest['format']}, this robot reads {FORMAT}")
+        self.header: dict[str, str] = manifest["header"]
+        for name, what in (("BOARD", "board"), ("LAYOUT", "layout of the card")):
+            if self.header[name] != present[name]:
+                raise Refused(f"the release is for {what} {self.header[name]}, this robot has {present[name]}")
+        if int(self.header["RELEASE"]) < int(present["FLOOR"]):
+            raise Refused(
+                f"release {self.header['RELEASE']} is below {present['FLOOR']}, the oldest that the running one admits"
+            )
+        self.chunk_bytes: int = manifest["chunk_bytes"]
+        self.chunks: list[str] = manifest["chunks"]
+        self.slot = Slot("B" if running.name == "A" else "A", writable=True)
+        size = int(self.header["BYTES"])
+        if not SECTOR <= self.chunk_bytes <= LARGEST_CHUNK or size > self.slot.size - HEADER_ROOM or size % SECTOR:
+            raise Refused(f"a release of {size} bytes does not fit into a slot of {self.slot.size}")
+        if len(self.chunks) != -(-size // self.chunk_bytes):
+            raise Refused(f"{len(self.chunks)} chunks are not what {size} bytes have")
+        self.size = size
+        self.present = present
+        self.running = present == self.header
+        self.base = running
+
+    def length(self, number: int) -> int:
+        return min(self.chunk_bytes, self.size - number * self.chunk_bytes)
+
+    def holds(self, number: int) -> bool:
+        """Whether the slot has this chunk."""
+        content = self.slot.read(number * self.chunk_bytes, self.length(number))
+        return hashlib.sha256(content).hexdigest() == self.chunks[number]
+
+    def missing(self) -> list[int]:
+        return [number for number in range(len(self.chunks)) if not self.holds(number)]
+
+    def take(self, number: int, content: bytes) -> None:
+        """Write a chunk, if it is the one that the release names."""
+        if number >= len(self.chunks) or hashlib.sha256(content).hexdigest() != self.chunks[number]:
+            raise Refused(f"chunk {number} is not what the release says")
+        self.slot.write(number * self.chunk_bytes, content)
+
+    def staged(self) -> bool:
+        """Whether the slot's header is this release's."""
+        return self.slot.header() == self.header
+
+    def empty_slot(self) -> None:
+        """Clear the header of the slot, unless there is none: what is written next is nobody's."""
+        if self.slot.header():
+            subprocess.run(["flotilla-slot", "clear", self.slot.name], check=True)
+
+    def said(self, missing: list[int]) -> dict[str, Any]:
+        return {
+            "release": self.header["RELEASE"],
+            "slot": self.slot.name,
+            "base": self.present["BLOB"],
+            "running": self.running,
+            "staged": self.staged(),
+            "missing": missing,
+            "chunk_bytes": self.chunk_bytes,
+        }
+
+
+def keys_of(slot: Slot, header: dict[str, str]) -> dict[str, Any]:
+    """Who signs what comes after the release in `slot`: `signatures`, how many are needed, and `keys`."""
+    first, count = map(int, header["KEYS"].split("+"))
+    found: dict[str, Any] = json.loads(bytes(slot.read(first * SECTOR, count * SECTOR)).rstrip(b" \0"))
+    return found
+
+
+def verify(text: str, signatures: list[str], trusted: dict[str, Any]) -> None:
+    """Refused unless enough of the trusted keys, each counted once, have signed the text."""
+    signed = set()
+    directory = f"{RUN}/flotilla-update-{os.getpid()}"
+    os.mkdir(directory, 0o700)
+    try:
+        for key in trusted["keys"]:
+            write_file(f"{directory}/allowed", f'{key["name"]} namespaces="{NAMESPACE}" {key["key"]}\n')
+            argv = ["ssh-keygen", "-Y", "verify", "-f", f"{directory}/allowed", "-I", key["name"], "-n", NAMESPACE]
+            argv += ["-s", f"{directory}/signature"]
+            for signature in signatures:
+                write_file(f"{directory}/signature", signature)
+                quiet = subprocess.DEVNULL
+                if subprocess.run(argv, input=text.encode(), stdout=quiet, stderr=quiet, check=False).returncode == 0:
+                    signed.add(key["name"])
+    finally:
+        subprocess.run(["rm", "-rf", directory], check=True)
+    if len(signed) < trusted["signatures"]:
+        names = ", ".join(key["name"] for key in trusted["keys"])
+        raise Refused(
+            f"the release has {len(signed)} of the {trusted['signatures']} signatures that the running one asks for, "
+            f"by the keys {names}"
+        )
+
+
+def write_file(path: str, text: str) -> None:
+    with open(path, "w") as file:
+        file.write(text)
+
+
+def known() -> Release:
+    """The release that has begun."""
+    try:
+        with open(f"{KNOWN}/release") as file:
+            told = json.load(file)
+    except FileNotFoundError:
+        raise Refused("no release has begun: `begin` first") from None
+    return Release(told["manifest"], told["signatures"])
+
+
+def begin() -> dict[str, Any]:
+    told = json.load(sys.stdin)
+    release = Release(told["manifest"], told["signatures"])
+    os.makedirs(KNOWN, mode=0o700, exist_ok=True)
+    beside = f"{KNOWN}/release.new"
+    with open(beside, "w") as file:
+        json.dump(told, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.rename(beside, f"{KNOWN}/release")
+    return release.said([] if release.running else release.missing())
+
+
+def frames(source: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Numbers and contents, until the input ends."""
+    while head := source.read(8):
+        if len(head) < 8:
+            raise Refused("the input ends within a chunk")
+        number, length = struct.unpack("<II", head)
+        if length > LARGEST_CHUNK:
+            raise Refused(f"chunk {number} has {length} bytes, at most {LARGEST_CHUNK} are read")
+        content = source.read(length)
+        if len(content) < length:
+            raise Refused("the input ends within a chunk")
+        yield number, content
+
+
+def copy() -> dict[str, Any]:
+    release = known()
+    if release.running:
+        raise Refused("this release runs already")
+    release.empty_slot()
+    for number in release.missing():
+        content = release.base.read(number * release.chunk_bytes, release.length(number))
+        if hashlib.sha256(content).hexdigest() == release.chunks[number]:
+            release.take(number, bytes(content))
+    release.slot.flush()
+    return release.said(release.missing())
+
+
+def write() -> dict[str, Any]:
+    release = known()
+    if release.running:
+        raise Refused("this release runs already")
+    release.empty_slot()
+    for number, content in frames(sys.stdin.buffer):
+        release.take(number, content)
+    release.slot.flush()
+    return release.said(release.missing())
+
+
+def delta() -> dict[str, Any]:
+    release = known()
+    if release.running:
+        raise Refused("this release runs already")
+    release.empty_slot()
+    with subprocess.Popen(["flotilla-patch", partition(release.base.name)], stdout=subprocess.PIPE) as patch:
+        for number in range(len(release.chunks)):
+            content = patch.stdout.read(release.length(number)) if patch.stdout else b""
+            if hashlib.sha256(content).hexdigest() != release.chunks[number]:
+                patch.kill()  # of another base, or cut off: what is missing comes as chunks
+                break
+            if not release.holds(number):
+                release.take(number, content)
+    release.slot.flush()
+    return release.said(release.missing())
+
+
+def finish() -> dict[str, Any]:
+    release = known()
+    missing = [] if release.running else release.missing()
+    if not missing and not release.running and not release.staged():
+        lines = "".join(f"{name}={value}\n" for name, value in release.header.items())
+        block = (SIGNATURE + lines.encode()).ljust(HEADER_BYTES, b"#")
+        release.slot.flush()
+        release.slot.write(release.slot.size - HEADER_ROOM, block)
+        release.slot.flush()
+    return release.said(missing)
+
+
+def activate() -> dict[str, Any]:
+    release = known()
+    if release.running:
+        raise Refused("this release runs already")
+    if not release.staged():
+        raise Refused(f"slot {release.slot.name} does not hold release {release.header['RELEASE']} yet: `finish` first")
+    subprocess.run(["rm", "-rf", f"{LAYERS}/{release.slot.name}"], check=True)
+    os.sync()
+    subprocess.run(["flotilla-slot", "trial", release.slot.name], check=True)
+    return release.said([])
+
+
+def yield_to_tasks() -> None:
+    """Use the processor and the card when nobody else does."""
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    subprocess.run(["ionice", "-c", "3", "-p", str(os.getpid())], check=True)
+
+
+def peak_kib() -> int:
+    """The most memory that this process has had; what getrusage(2) says may be its parent's."""
+    with open("/proc/self/status") as status:
+        return int(next(line.split()[1] for line in status if line.startswith("VmHWM:")))
+
+
+def main() -> int:
+    commands = {each.__name__: each for each in (begin, copy, write, delta, finish, activate)}
+    if len(sys.argv) != 2 or sys.argv[1] not in commands:
+        print(__doc__, file=sys.stderr)
+        return 2
+    yield_to_tasks()
+    try:
+        said = commands[sys.argv[1]]()
+    except (Refused, OSError, ValueError, KeyError, subprocess.CalledProcessError) as error:
+        print(f"update: {error}" if isinstance(error, Refused) else f"update: {error!r}", file=sys.stderr)
+        return 1
+    said["memory_kib"] = peak_kib()
+    print(json.dumps(said))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

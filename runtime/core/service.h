@@ -1,0 +1,43 @@
+/* The runtime's side of a block: its memory, its last failure, the priority of its threads. */
+#ifndef FLOTILLA_SERVICE_H
+#define FLOTILLA_SERVICE_H
+
+#include <flotilla/block.h>
+#include <pthread.h>
+
+enum {
+    FL_FAILURE_BYTES = 256,
+    FL_CACHE_LINE = 64, /* bytes; rings keep their two ends on lines of their own */
+};
+
+struct fl_memory {
+    struct fl_memory *next;
+};
+
+struct fl_service {
+    struct fl_memory *memory;
+    char failure[FL_FAILURE_BYTES];
+    bool ended;      /* by fl_end() */
+    bool *wired;     /* which inputs are */
+    int priority;    /* SCHED_FIFO of the block's threads; 0: ordinary */
+    int patience_ms; /* how long to wait for a device that another process holds */
+    int claim_fd;    /* holds the block's device (device.h); below 1: none */
+    struct fl_port *in_ports, *out_ports;
+    size_t near_used; /* of the bytes beside the block */
+
+    /* Blocks inside this one (flotilla/inner.h), which the executive keeps. */
+    struct registry *registry;                           /* where their types are looked for; NULL: it can have none */
+    struct fl_inner *inner;                              /* the last one first */
+    void (*destroy_inner)(const struct fl_block *outer); /* NULL: it has none */
+    bool inner_failed;
+};
+
+/* Call enter(argument) with a stack beside it for signal handlers, so that they can run when the own stack of the
+ * thread is used up. */
+void *fl_service_enter(void *(*enter)(void *), void *argument);
+
+/* Start a thread named after the block, at the service's priority where that is allowed; 0 or an errno. */
+int fl_service_thread(struct fl_service *service, pthread_t *thread, const char *name, void *(*enter)(void *),
+                      void *argument);
+
+#endif

@@ -1,0 +1,72 @@
+"""Who the robot is, and who gets in."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+from flotilla.common import paths
+from flotilla.fleet.model import Board, Fleet
+from flotilla.robot import ssh
+from tests.boot.guests import SECONDS, has_its_identity, sh
+from tests.conftest import RobotGuest
+
+
+def test_identity(robot: RobotGuest, fleet: Fleet) -> None:
+    has_its_identity(robot, fleet)
+
+
+def test_it_has_its_address_and_no_other(robot: RobotGuest, board: Board, fleet: Fleet) -> None:
+    found = {
+        interface["ifname"]: {f"{address['local']}/{address['prefixlen']}" for address in interface["addr_info"]}
+        for interface in json.loads(sh(robot, "ip -json address"))
+    }
+    own = f"{robot.robot.address}/{fleet.network.subnet.prefixlen}"
+    assert found == {"lo": {"127.0.0.1/8", "::1/128"}, board.network_interface: {own}}
+    routes = [route["dst"] for route in json.loads(sh(robot, "ip -json route"))]
+    assert routes == [str(fleet.network.subnet)], f"routes to {routes}"
+
+
+def _ssh(robot: RobotGuest, command: str, **changes: str) -> subprocess.CompletedProcess[str]:
+    """A connection of its own, with other settings than everybody's."""
+    options = [word for word in ssh.options(robot.robot) if word != "-o"]
+    settings = dict(option.split("=", 1) for option in options) | changes
+    argv = ["ssh", "-F", "none", *(f"-o{name}={value}" for name, value in settings.items())]
+    argv += ["-p", str(robot.machine.ssh_port()), "127.0.0.1", command]
+    return subprocess.run(argv, capture_output=True, text=True, timeout=SECONDS, check=False)
+
+
+def test_host_key_is_the_pinned_one(robot: RobotGuest, tmp_path: Path) -> None:
+    """All other tests come in by the pinned key; with another's pinned, nobody does."""
+    known = tmp_path / "known_hosts"
+    other = (paths.KEYS / "operator_ed25519.pub").read_text().split()[:2]
+    known.write_text(f"{robot.robot.name} {' '.join(other)}\n")
+    done = _ssh(robot, "true", UserKnownHostsFile=str(known))
+    assert done.returncode == 255, f"let in with a wrong host key pinned: {done}"
+    assert "Host key verification failed" in done.stderr, done.stderr
+    assert _ssh(robot, "echo in").stdout == "in\n"
+
+
+def test_nobody_else_gets_in(robot: RobotGuest, tmp_path: Path) -> None:
+    as_root = _ssh(robot, "true", User="root")
+    assert as_root.returncode == 255, f"root was let in: {as_root}"
+    assert "Permission denied (publickey)" in as_root.stderr, as_root.stderr
+    key = tmp_path / "key"
+    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
+    stranger = _ssh(robot, "true", IdentityFile=str(key))
+    # The only method named is the one offered: passwords are not asked for.
+    assert "Permission denied (publickey)" in stranger.stderr, f"a strange key: {stranger}"
+
+
+def test_nobody_has_a_password(robot: RobotGuest) -> None:
+    fields = [line.split(":") for line in sh(robot, "cat /etc/shadow").splitlines()]
+    assert len(fields) > 10, f"that is not the shadow file: {fields}"
+    assert not (found := [line[0] for line in fields if line[1] not in ("!", "*", "!*")]), f"not locked: {found}"
+    done = robot.shell.run(["su", "-c", "id"], check=False, stdin="robot\n")
+    assert done.returncode, f"became root by a password: {done.stdout}"
+
+
+def test_robot_becomes_root(robot: RobotGuest) -> None:
+    assert robot.shell.run(["id", "-u"]).stdout == "1000\n"
+    assert robot.shell.run(["sudo", "-n", "id", "-u"]).stdout == "0\n"

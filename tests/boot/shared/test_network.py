@@ -1,0 +1,44 @@
+"""Who listens on the network, and what gets in."""
+
+from __future__ import annotations
+
+import re
+
+from flotilla.fleet import identity
+from flotilla.fleet.model import Fleet
+from tests.boot.guests import call, sh
+from tests.boot.shared.probes import firewall
+from tests.conftest import RobotGuest
+
+
+def test_only_ssh_and_time_listen(robot: RobotGuest) -> None:
+    assert _listeners(robot) == {("tcp", "22", "sshd"), ("udp", "123", "chronyd")}
+    sh(robot, "systemd-run --quiet --unit a-test busybox nc -l -p 2323")
+    try:
+        found = _listeners(robot)
+        assert any(port == "2323" for _, port, _ in found), f"a further listener was not seen: {found}"
+    finally:
+        sh(robot, "systemctl stop a-test")
+
+
+def _listeners(robot: RobotGuest) -> set[tuple[str, str, str]]:
+    found = set()
+    for line in sh(robot, "ss --no-header --tcp --udp --raw --packet --listening --numeric --processes").splitlines():
+        kind, _, _, _, address, *_ = line.split()
+        program = re.search(r'\(\("([^"]+)"', line)
+        found.add((kind, address.rpartition(":")[2], program[1] if program else "?"))
+    return found
+
+
+def test_firewall_admits_the_fleet_alone(robot: RobotGuest, fleet: Fleet) -> None:
+    """By packets from a neighbour, a network namespace at the other end of a virtual cable."""
+    taken = [host.address for host in identity.hosts(fleet)]
+    inside = next(address for address in fleet.network.subnet.hosts() if address not in taken)
+    dds = 7400 + 250 * fleet.network.dds_domain + 10
+    closed = call(robot, firewall, str(inside), dds, "")
+    open_for_fleet = {"tcp 22", f"udp {dds}", "udp 5000", "ping"}
+    assert set(closed["inside"]) == open_for_fleet, f"from {inside}: {closed['inside']}"
+    assert closed["outside"] == [], f"from outside the subnet: {closed['outside']}"
+    opened = call(robot, firewall, str(inside), dds, "insert rule inet flotilla input accept")
+    everything = open_for_fleet | {"tcp 2323", "udp 2323"}
+    assert set(opened["outside"]) == everything, f"with an open firewall only {opened} came through: a blind probe"

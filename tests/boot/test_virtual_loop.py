@@ -1,0 +1,89 @@
+"""Control loops inside one guest in virtual time are judged, and have the very latency that was accepted."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Board, Fleet
+from lab.latency import virtual_loop
+from lab.latency.results import Latency
+from lab.latency.virtual_loop import SECONDS, TARGET_RAD_S, run
+
+UNREADY = 80
+"""Frames that give no rate: those until the driver is sure of the gyro's mode, and those that its commands garble, as
+this line brings them back. It says the mode anew every 100 frames. The accepted histogram counts them exactly."""
+SETTLED = 300
+"""Steps after which the velocity loop, whose drive first has to be configured, has to hold."""
+
+
+@pytest.fixture(scope="module")
+def board(fleet: Fleet) -> Board:
+    return virtual_loop.board_of(fleet)
+
+
+@pytest.fixture(scope="module")
+def said(board: Board, session_artefacts: Path) -> dict[str, str]:
+    return run(board, session_artefacts / "virtual-loop")
+
+
+def read(text: str) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(text)
+    return content
+
+
+def test_a_frame_becomes_a_valve_within_two_periods(said: dict[str, str]) -> None:
+    histogram = virtual_loop.chain(said).histogram_us
+    assert read(said["chain"])["late"] == 0
+    assert sum(histogram.values()) >= SECONDS * 100 - UNREADY, "frames are lost"
+    print(f"frame to valve: {min(histogram)} to {max(histogram)} µs")
+    assert max(histogram) < 20_000
+
+
+def test_a_frame_becomes_a_valve_as_late_as_was_accepted(said: dict[str, str]) -> None:
+    virtual_loop.check(virtual_loop.chain(said))
+
+
+def test_another_latency_is_refused_with_what_moved(said: dict[str, str], tmp_path: Path) -> None:
+    found = virtual_loop.chain(said)
+    file = tmp_path / "accepted.json"
+    with pytest.raises(UserError, match=r"is missing.*make latency-accept"):
+        virtual_loop.check(found, file)
+    file.write_text(json.dumps(found.histogram_us))
+    virtual_loop.check(found, file)
+    later = Latency.of({us + 7: count for us, count in found.histogram_us.items()})
+    with pytest.raises(UserError, match=rf"min {min(found.histogram_us)} → {min(later.histogram_us)}.*accept"):
+        virtual_loop.check(later, file)
+
+
+def test_two_rates_on_one_computer_keep_their_time(said: dict[str, str]) -> None:
+    assert sorted(said["both"].splitlines()) == ["fast: 0", "slow: 0"]
+    fast, slow = read(said["fast"]), read(said["slow"])
+    assert (fast["overruns"], slow["overruns"]) == (0, 0)
+    assert fast["step"]["count"] == SECONDS * 100
+    assert slow["step"]["count"] == SECONDS * 10
+    print(f"jitter: {fast['jitter']['max_ns'] / 1000} µs at 10 ms, {slow['jitter']['max_ns'] / 1000} µs at 100 ms")
+    assert fast["jitter"]["max_ns"] < 100_000
+    assert slow["jitter"]["max_ns"] < 100_000
+
+
+def test_a_drive_on_can_holds_its_velocity(said: dict[str, str]) -> None:
+    """Driver, bus, drive and back at 100 Hz. Seen to fail with a controller whose gains are zero."""
+    *lines, left = said["drive"].splitlines()
+    rows = [read(line) for line in lines][SETTLED:]
+    assert len(rows) == SECONDS * 100 - SETTLED
+    assert {(row["drive.enabled"], row["drive.flag"], row["drive.abort"]) for row in rows} == {(1, 1, 0)}
+    velocities = [row["drive.velocity"] for row in rows]
+    print(f"velocity: {min(velocities):.2f} to {max(velocities):.2f} rad/s")
+    assert all(math.isclose(velocity, TARGET_RAD_S, rel_tol=0.05) for velocity in velocities)
+    assert left == "SWITCH_ON_DISABLED", "the drive keeps its power"
+
+
+def test_loops_repeat_to_the_byte(said: dict[str, str], board: Board, artefacts: Path) -> None:
+    """Seen to fail with a plug-in that writes its process number into a file that is shown."""
+    assert run(board, artefacts) == said

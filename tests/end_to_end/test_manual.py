@@ -1,0 +1,268 @@
+"""Every command of the documents works: each is run as it stands there, or says here why it cannot be.
+
+The tutorial is followed as a whole: its commands and files in their order, with one guest.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from flotilla.common import paths
+from flotilla.fleet.model import Fleet
+from flotilla.robot import ssh
+from images.builder import verify
+from lab.qemu.console import SerialConsole
+from lab.qemu.ssh import Ssh
+
+DOCS = paths.PROJECT / "docs"
+TUTORIAL = DOCS / "tutorial.md"
+PAGES = [paths.PROJECT / "README.md", *sorted((DOCS / "how-to").glob("*.md"))]
+COMMANDS = "sh"
+"""Language of code that is commands. Other code is a file when its first line says which."""
+NEEDS_ROBOTS = "needs the robots; test_fleet.py plays the same on guests"
+ELSEWHERE = {
+    "make test": "is what runs this",
+    "make rotate-key ROBOT=3": "changes the keys; test_fleet.py rotates one by the playbook",
+    "make rotate-key ROBOT=3 RETIRE=1": "likewise",
+    "lsblk": "shows this computer's disks, no program of ours",
+    "make flash ROBOT=3 DEV=/dev/sdX": "needs a card; into a file below, on block devices in unit/test_flash.py",
+    "build/venv/bin/python -m serial.tools.miniterm /dev/ttyUSB0 115200": "needs a cable",
+    "sudo ip address add 10.42.0.254/24 dev eth0": "changes this computer's network",
+    "ping 10.42.0.3": "needs the robot",
+    "make hwcheck ROBOT=3": "needs the robot; tests/boot/shared asks guests the same",
+    "make latency TARGET=ssh:robot3": "needs the robot; test_latency_target.py measures a guest",
+    **dict.fromkeys(
+        (
+            'make provision ARGS="--check --diff"',
+            "make provision",
+            "make provision ROBOT=3",
+            "make provision PLAYBOOK=tasks",
+            'make provision PLAYBOOK=tasks ARGS="-e do=stop -e task=heading"',
+            "make provision PLAYBOOK=collect",
+            "make provision PLAYBOOK=reboot",
+            'make provision ROBOT=3 ARGS="-e current_address=10.42.0.3"',
+            'make provision PLAYBOOK=replace ARGS="-e replaced=robot3"',
+            'make provision PLAYBOOK=replace ARGS="-e replaced=robot3 -e rotate=true"',
+        ),
+        NEEDS_ROBOTS,
+    ),
+    **dict.fromkeys(
+        (
+            'make update ARGS="--tags stage"',
+            "make update",
+            'make update ROBOT=3 ARGS="-e stop_tasks=true"',
+            'make update ROBOT=3 ARGS="-e go=back"',
+        ),
+        "needs the robots; test_update.py plays the same on a guest",
+    ),
+    **dict.fromkeys(("make releases", "make releases ROBOT=3"), "needs the robots; unit/test_releases.py"),
+    **dict.fromkeys(
+        ("make cve TRACKER=tracker.json.xz", "make cve TRACKER=tracker.json.xz JSON=1"),
+        "needs the tracker's data; unit/test_cve.py",
+    ),
+    **dict.fromkeys(
+        (
+            "ssh-keygen -Y sign -n flotilla-release -f KEY smartcoret3.manifest.json",
+            'make bundle BOARD=smartcoret3 SIGNATURES="alice.sig bob.sig"',
+        ),
+        "needs the keys of others; runtime/test_update.py signs so",
+    ),
+    "sudo make fleet-scale N=32": "test_fleet_scale.py runs it for fewer",
+    "make lock": "asks the mirror for other packages; unit/test_lock.py",
+    "make param ROBOT=1 TASK=heading": "needs the robot; test_control_loop.py asks a guest",
+    "make param ROBOT=1 TASK=heading PARAM=attitude.kp VALUE=2.5": "needs the robot; test_control_loop.py asks a guest",
+    "make deploy ROBOT=3 APP=apps/hover": "runs until Ctrl-C; test_deploy.py",
+    "make deploy ROBOT=3 APP=apps/hover RUN=status": "needs the robot; test_deploy.py asks a guest",
+    "make deploy ROBOT=3 APP=apps/hover ON_ROBOT=1": "needs the robot; test_deploy.py compiles on a guest",
+    "make verify ROBOT=3": "test_verify.py",
+    "make latency": "test_latency.py measures the same",
+    "make latency-accept": "changes what tests compare with",
+}
+"""Commands that need hardware, a terminal or time, with who does the like."""
+BEGINNINGS = ("make ", "build/runtime/flotilla-", "mkdir -p build/")
+"""Of commands that are ours to run."""
+SHOWN = {
+    "make check-fleet": "robot3",
+    "make deploy ROBOT=3 APP=apps/hover KEEP=1": "ActiveState=active",
+    "make param ROBOT=3 TASK=hover": "hover.band",
+    "make param ROBOT=3 TASK=hover PARAM=hover.band VALUE=0.2": "0.2",
+    "make deploy ROBOT=3 APP=apps/hover RUN=stop": "period 10 ms",
+    "make deploy ROBOT=3 APP=apps/hover RUN=remove": "hover is gone",
+}
+"""What some commands of the tutorial say, in part."""
+BOOT = "make boot ROBOT=3"
+"""Takes a terminal, and stays."""
+BOOT_SECONDS = 300
+"""Until the login prompt: finite, and generous to a busy host."""
+
+
+@dataclass(frozen=True)
+class Code:
+    """A fenced block of a page."""
+
+    language: str
+    text: str
+
+    @property
+    def commands(self) -> list[str]:
+        """One a line, without comments."""
+        lines = self.text.splitlines() if self.language == COMMANDS else []
+        return [command for line in lines if (command := line.partition("#")[0].strip())]
+
+    @property
+    def file(self) -> Path | None:
+        """The app's file that the first line names."""
+        named = re.match(r"(?:/\*|#) (apps/\S+):", self.text)
+        return paths.PROJECT / named[1] if named else None
+
+
+def code(page: Path) -> list[Code]:
+    fences = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    return [Code(language, text) for language, text in fences]
+
+
+def commands(*pages: Path) -> list[str]:
+    """Each once."""
+    return list(dict.fromkeys(command for page in pages for block in code(page) for command in block.commands))
+
+
+def run(command: str) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MAKELEVEL")}
+    done = subprocess.run(
+        command,
+        shell=True,
+        cwd=paths.PROJECT,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
+    return done
+
+
+def left_to_run() -> list[str]:
+    """Of the pages, without what the tutorial runs."""
+    return [command for command in commands(*PAGES) if command not in {*ELSEWHERE, *commands(TUTORIAL)}]
+
+
+@pytest.mark.parametrize("command", left_to_run())
+def test_command(command: str, flotilla_run: Path) -> None:
+    assert command.startswith(BEGINNINGS), "not ours to run here: say in ELSEWHERE why"
+    run(command)
+
+
+def test_no_reason_outlives_its_command() -> None:
+    assert set(ELSEWHERE) <= set(commands(*PAGES))
+    assert {*SHOWN, BOOT} <= set(commands(TUTORIAL))
+    assert not set(ELSEWHERE) & set(commands(TUTORIAL)), "the tutorial is run as it stands"
+
+
+class Terminal:
+    """A command on a terminal of its own; the wire of a console (`console.Line`)."""
+
+    def __init__(self, command: str) -> None:
+        self._ours, theirs = os.openpty()
+        self.process = subprocess.Popen(
+            command, shell=True, cwd=paths.PROJECT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True
+        )
+        os.close(theirs)
+
+    def recv(self, size: int, /) -> bytes:
+        try:
+            return os.read(self._ours, size)
+        except OSError:  # nobody has the other end any more
+            return b""
+
+    def sendall(self, data: bytes, /) -> None:
+        os.write(self._ours, data)
+
+    def close(self) -> None:
+        os.close(self._ours)
+
+
+@contextmanager
+def booted(fleet: Fleet, log: Path) -> Iterator[None]:
+    """BOOT on a terminal while the body runs, once it lets `make ssh` in; then Ctrl-A X."""
+    terminal = Terminal(BOOT)
+    console = SerialConsole(log, lambda: f"status {terminal.process.poll()}")
+    try:
+        console.attach(terminal)
+        console.expect(r"robot3 login: ", BOOT_SECONDS)
+        port = ssh.forwarded_port(fleet.robots[3])
+        assert port
+        with Ssh(fleet.robots[3], "127.0.0.1", lambda: port) as shell:
+            shell.connect()
+        yield
+        console.send("\x01x")
+        assert terminal.process.wait(BOOT_SECONDS) == 0
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(terminal.process.pid, signal.SIGKILL)
+        terminal.process.wait()
+        console.close()
+
+
+def test_a_stranger_follows_the_tutorial_to_a_block_of_their_own(fleet: Fleet, tmp_path: Path) -> None:
+    """From an installed computer to a guest that runs the block of the page, as the page says, and a flight."""
+    app = paths.PROJECT / "apps" / "hover"
+    assert not app.exists(), "the tutorial's app is there already; move it away"
+    blocks = code(TUTORIAL)
+    at = [BOOT in block.commands for block in blocks].index(True)
+    try:
+        follow(blocks[:at])
+        with booted(fleet, tmp_path / "terminal.log"):
+            follow(blocks[at + 1 :])
+    finally:
+        shutil.rmtree(app, ignore_errors=True)
+        with suppress(OSError):  # not there, or somebody's apps are in it
+            app.parent.rmdir()
+
+
+def follow(blocks: list[Code]) -> None:
+    for block in blocks:
+        if block.file:
+            assert block.file.exists(), f"{block.file}: the page makes it before it is changed"
+            block.file.write_text(block.text)
+        for command in block.commands:
+            assert command.startswith(BEGINNINGS)
+            assert SHOWN.get(command, "") in run(command).stdout, command
+
+
+def test_flash_into_a_file(tmp_path: Path) -> None:
+    card = tmp_path / "card.img"
+    run(f"make flash ROBOT=3 CARD={card}")
+    assert card.read_bytes() == (paths.IMAGES / "robot3.img").read_bytes()
+
+
+def test_one_more_robot(tmp_path: Path) -> None:
+    """Three copied lines in a copy of the checkout, with the results that this one's builds left."""
+    checkout, keys = tmp_path / "checkout", tmp_path / "keys"
+    verify.copy_checkout(checkout)
+    shutil.copytree(paths.KEYS, keys)
+    robots = checkout / paths.INVENTORY.relative_to(paths.PROJECT) / "robots.yml"
+    lines = re.search(r"^ *robot4:\n.*\n.*\n", robots.read_text(), re.MULTILINE)
+    assert lines
+    added = lines[0].replace("robot4", "robot5").replace("number: 4", "number: 5").replace("10.42.0.4", "10.42.0.5")
+    robots.write_text(robots.read_text().replace(lines[0], lines[0] + added))
+    argv = [sys.executable, "-m", "flotilla", "image", "5"]
+    environment = os.environ | {"BUILD": str(paths.BUILD), "KEYS": str(keys)}
+    try:
+        done = subprocess.run(argv, cwd=checkout, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert (paths.IMAGES / "robot5.img").exists()
+        assert "root file system" not in done.stderr  # the board's results were of use
+    finally:
+        for output in paths.IMAGES.glob("robot5.*"):
+            output.unlink()

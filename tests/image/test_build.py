@@ -1,0 +1,198 @@
+"""Builds that do not end well: what they leave, and what they say."""
+
+from __future__ import annotations
+
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flotilla.common import namespace, paths
+from flotilla.fleet import inventory
+
+ROBOT = 3
+BOARD = inventory.load_fleet().robots[ROBOT].board
+_PATIENCE_S = 300
+"""Some 30 s on an idle host."""
+
+
+def _link(source: str | Path, target: str | Path) -> None:
+    """The same file, or a copy where that is on another disk."""
+    try:
+        Path(target).hardlink_to(source)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+@pytest.fixture
+def build(tmp_path: Path) -> Path:
+    """An empty build directory with the pool of the real one, and an image that a failure must not harm."""
+    directory = tmp_path / "build"
+    (directory / "pool").mkdir(parents=True)
+    for package in paths.POOL.glob("*.deb"):
+        _link(package, directory / "pool" / package.name)
+    (directory / "images").mkdir()
+    (directory / "images" / "robot3.img").write_text("the last good image")
+    return directory
+
+
+def _argv(build: Path) -> tuple[list[str], dict[str, str]]:
+    return [sys.executable, "-m", "flotilla", "image", str(ROBOT)], os.environ | {"BUILD": str(build)}
+
+
+def _in_namespace(script: str, argv: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """Run a build after a shell script that changes the mounts it sees."""
+    whole = [*namespace.prefix(), "sh", "-c", script, "sh", *argv]
+    return subprocess.run(whole, env=environment, cwd=paths.PROJECT, capture_output=True, text=True)
+
+
+def _processes(build: Path) -> set[int]:
+    """Everything that works in or for a build directory, inside its namespaces too."""
+    found = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (process / "environ").read_bytes()
+            root = (process / "root").readlink()
+        except OSError:
+            continue  # ended meanwhile, or is the kernel's
+        if str(build).encode() in words or root.is_relative_to(build):
+            found.add(int(process.name))
+    return found
+
+
+@pytest.fixture
+def running(build: Path) -> Iterator[subprocess.Popen[str]]:
+    """A build in the middle of debootstrap. What comes before that, tools and runtime, is the real build's."""
+    for kind in ("tools", "runtime"):
+        for result in paths.CACHE.glob(f"{kind}-*[0-9a-f]"):
+            shutil.copytree(result, build / "cache" / result.name, symlinks=True, copy_function=_link)
+    argv, environment = _argv(build)
+    process = subprocess.Popen(
+        ["env", "--default-signal=INT", *argv],  # background jobs of a script inherit that it is ignored
+        env=environment, cwd=paths.PROJECT, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    log = build / f"rootfs-{BOARD}.log"
+    timer = select.poll()  # waits for the process's end, and wakes now and then to look at the log
+    descriptor = os.pidfd_open(process.pid)
+    timer.register(descriptor, select.POLLIN)
+    try:
+        for _ in range(_PATIENCE_S * 10):
+            if log.exists() and "Configuring" in log.read_text():
+                break
+            assert not timer.poll(100), process.communicate()[1]
+        else:
+            pytest.fail("the build never reached debootstrap's second stage")
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        if process.stderr:
+            process.stderr.close()
+        os.close(descriptor)
+
+
+def _gone(pids: set[int]) -> bool:
+    """Whether all of them end in time."""
+    for pid in pids:
+        try:
+            descriptor = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        ended = select.select([descriptor], [], [], 10)[0]
+        os.close(descriptor)
+        if not ended:
+            return False
+    return True
+
+
+def test_an_interrupted_build_leaves_the_last_good_image_and_nothing_else(
+    build: Path, running: subprocess.Popen[str]
+) -> None:
+    pids = _processes(build)
+    assert len(pids) >= 2, "the negative control: a running build is seen"
+    os.killpg(running.pid, signal.SIGINT)
+    _, errors = running.communicate(timeout=30)
+    assert running.returncode == 130, errors
+    assert "interrupted; the last good outputs are untouched" in errors
+    assert _gone(pids)
+    assert _processes(build) == set()
+    assert str(build) not in Path("/proc/self/mounts").read_text()
+    assert (build / "images" / "robot3.img").read_text() == "the last good image"
+    assert [path.name for path in (build / "images").iterdir()] == ["robot3.img"]
+    assert not list((build / "cache").glob("*.part"))
+    assert not list((build / "cache").glob("rootfs-*"))
+
+
+def test_a_killed_build_leaves_no_process_and_no_result(build: Path, running: subprocess.Popen[str]) -> None:
+    pids = _processes(build)
+    running.kill()
+    running.wait()
+    assert _gone(pids)
+    assert _processes(build) == set()
+    assert [path.suffix for path in (build / "cache").glob("rootfs-*")] == [".part"], "half, and named so"
+    assert (build / "images" / "robot3.img").read_text() == "the last good image"
+
+
+@pytest.mark.parametrize(
+    ("room", "fill", "message"),
+    [
+        ("100m", "", "a build needs 1.0 GiB"),
+        ("1200m", f"(for _ in $(seq 600); do [ ! -s $BUILD/rootfs-{BOARD}.log ] || break; sleep 0.1; done; "
+         "dd if=/dev/zero of=$BUILD/filler bs=1M 2>/dev/null) &", "no space left"),
+    ],
+    ids=["from the start", "while building"],
+)  # fmt: skip
+def test_a_full_disk_is_said_so(build: Path, tmp_path: Path, room: str, fill: str, message: str) -> None:
+    """A disk that is too small from the start, and one that something else fills while the build runs."""
+    argv, environment = _argv(build)
+    pool = tmp_path / "pool"
+    (build / "pool").rename(pool)
+    script = f'mount -t tmpfs -o size={room} none "$BUILD" && ln -s {pool} "$BUILD/pool" && {fill or ":;"} exec "$@"'
+    done = _in_namespace(script, argv, environment)
+    assert done.returncode == 1, done.stderr
+    assert message in done.stderr
+    assert "BUILD=" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_wrong_hash_in_the_pool_stops_the_build(build: Path) -> None:
+    from images.builder.lock import read_lock
+
+    package = read_lock(BOARD).packages[0]
+    file = build / "pool" / f"{package.sha256}.deb"
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.unlink()  # it is a link to the real pool's
+    file.write_bytes(content)
+    argv, environment = _argv(build)
+    done = subprocess.run(argv, env=environment, cwd=paths.PROJECT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert f"package {package.name} {package.version}" in done.stderr
+    assert "delete the file and run again" in done.stderr
+    assert (build / "images" / "robot3.img").read_text() == "the last good image"
+
+
+def test_without_a_mirror_the_remedy_is_named(build: Path, tmp_path: Path) -> None:
+    """An empty pool where apt knows no Debian: the host's configuration is hidden."""
+    shutil.rmtree(build / "pool")
+    argv, environment = _argv(build)
+    for name in ("MIRROR", "SECURITY_MIRROR", "SNAPSHOT"):
+        environment.pop(name, None)
+    done = _in_namespace('mount -t tmpfs none /etc/apt && exec "$@"', argv, environment)
+    assert done.returncode == 1
+    assert "MIRROR=" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_an_unknown_robot_is_refused_with_the_known_ones(build: Path) -> None:
+    argv, environment = _argv(build)
+    done = subprocess.run([*argv[:-1], "9"], env=environment, cwd=paths.PROJECT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "robot 9" in done.stderr
+    assert "1, 2, 3, 4" in done.stderr

@@ -1,1 +1,0 @@
-"""The QEMU laboratory: guests, their consoles, networks and shells, behind protocols that real robots can serve too."""

@@ -1,0 +1,155 @@
+"""Robots in containers: `fleet.yml` finds them as it finds robots, repairs drift, and nothing of them stays.
+
+This module is also what runs in their namespaces (`main`), since only there they can be reached.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flotilla.common import namespace, paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
+from flotilla.fleet.model import Fleet
+from lab.containers import container, scale
+from lab.qemu.ssh import Ssh
+from lab.qemu.timing import Deadline, LabError
+
+pytestmark = pytest.mark.nightly
+
+RUN_SECONDS = 600
+DRIFT = {
+    "echo 10.42.0.99 stranger >>/etc/hosts": "/etc/hosts has another content",
+    "rm /etc/chrony/chrony.conf": "/etc/chrony/chrony.conf is missing",
+    "rm -r /etc/systemd/system/multi-user.target.wants": "multi-user.target.wants was removed",
+    "sysctl -q kernel.panic=0": "kernel.panic = 0, not 10",
+    "nft flush ruleset": "the rules in force are others",
+    "systemctl stop nftables": "nftables.service does not run",
+}
+"""What drifts on robot 2, and how the report names it."""
+
+
+@pytest.fixture(autouse=True)
+def _where_they_can_be() -> None:
+    try:
+        container.check()
+    except UserError as error:
+        pytest.skip(str(error))
+
+
+def test_growth_is_measured_and_nothing_stays() -> None:
+    before = left()
+    done = subprocess.run(scale_command("4"), cwd=paths.PROJECT, capture_output=True, text=True, check=False,
+                          timeout=RUN_SECONDS)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    result = json.loads(scale.RESULT.read_text())
+    assert [sample["robots"] for sample in result["samples"]] == [1, 2, 4]
+    assert all(sample[field] > 0 for sample in result["samples"] for field in (*scale.TIMES, "boot_s", "memory_mib"))
+    assert result["lines"].keys() == set(scale.TIMES)
+    assert "no robot was changed" in done.stdout
+    assert left() == before
+
+
+def test_drift_of_one_is_found_and_mended(fleet: Fleet, tmp_path: Path) -> None:
+    """The first run also shows that a run which changed a robot is refused."""
+    directory = scale.describe(4, fleet.robots[4].board, tmp_path / "inventory")
+    image = scale.image_for(fleet, fleet.robots[4].board)
+    argv = [sys.executable, "-m", "tests.provisioning.test_fleet_scale", str(directory), str(image), str(tmp_path)]
+    before = left()
+    try:
+        done = subprocess.run(
+            container.inside(argv), env=scale.environment(tmp_path), cwd=paths.PROJECT, capture_output=True, text=True,
+            check=False, timeout=RUN_SECONDS,
+        )  # fmt: skip
+    finally:
+        container.clean()
+    assert done.returncode == 0, done.stderr
+    refused, first, second = json.loads(done.stdout)
+    names = [f"robot{number}" for number in range(1, 5)]
+    outcomes = [{name: robot["outcome"] for name, robot in run.items()} for run in (first, second)]
+    assert outcomes == [
+        dict.fromkeys(names, "up to date") | {"robot2": "changed"},
+        dict.fromkeys(names, "up to date"),
+    ]
+    for words in DRIFT.values():
+        assert any(words in line for line in first["robot2"]["repaired"]), (words, first["robot2"]["repaired"])
+    assert "robot2" in refused
+    assert "robot1" not in refused
+    assert left() == before
+
+
+@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGKILL])
+def test_nothing_stays_of_a_run_that_was_ended(ended_by: signal.Signals) -> None:
+    """Ctrl-C goes to all processes of the terminal; a killed run can do nothing, and the next one cleans up."""
+    before = left()
+    run = subprocess.Popen(
+        scale_command("2"), cwd=paths.PROJECT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    wait_until(lambda: any("/sbin/init" in found for found in left() - before))
+    if ended_by == signal.SIGINT:
+        os.killpg(run.pid, ended_by)
+    else:
+        run.kill()
+    _, said = run.communicate(timeout=60)
+    assert run.returncode == (130 if ended_by == signal.SIGINT else -ended_by), said
+    wait_until(lambda: not [found for found in left() - before if not found.startswith("control group")])
+    container.clean()
+    assert left() == before
+
+
+def scale_command(*argv: str) -> list[str]:
+    return [sys.executable, "-m", "flotilla", "fleet-scale", *argv]
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = Deadline(60)
+    while not condition():
+        assert not deadline.expired
+        time.sleep(0.05)
+
+
+def left() -> set[str]:
+    """What there is of robots in containers here, in words: processes, control groups, loop devices, networks."""
+    found = {f"network {path.name}" for path in Path("/sys/class/net").iterdir()}
+    found |= {f"loop device of {path.read_text()}" for path in Path("/sys/block").glob("loop*/loop/backing_file")}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if "/flotilla-light-" in (process / "cgroup").read_text():
+                found.add(f"process {process.name} {(process / 'cmdline').read_text()}")
+        except OSError:
+            continue  # it has ended meanwhile
+    script = "mount -t cgroup2 none /mnt && ls /mnt"
+    groups = subprocess.run([*namespace.prefix(), "sh", "-c", script], capture_output=True, text=True, check=True)
+    return found | {f"control group {name}" for name in groups.stdout.split() if name.startswith("flotilla-light")}
+
+
+def main(directory: Path, image: Path, log: Path) -> None:
+    """In namespaces: let robot 2 drift, play twice; print what was refused of the first run, and both reports."""
+    fleet = inventory.load_fleet(directory)
+    robots = list(fleet.robots.values())
+    container.boot(fleet, robots, image, log)
+    with Ssh(fleet.robots[2], str(fleet.robots[2].address)) as shell:
+        for script in DRIFT:
+            shell.run(["sudo", "sh", "-ec", script])
+    first = scale.play([directory])
+    try:
+        first.check_unchanged([robot.name for robot in robots])
+        refused = ""
+    except LabError as error:
+        refused = str(error)
+    second = scale.play([directory])
+    print(json.dumps([refused, first.robots, second.robots]))
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))

@@ -1,0 +1,217 @@
+"""Every shape of `tests/fixtures/ert_shapes.py` as a block: response, parameters from the task file and while it runs.
+
+All is compiled by this computer's compiler but for the last test, which takes the locked ones.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from flotilla.apps import app, builder, ert
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Fleet
+from images.builder import runtime
+from tests.fixtures.ert_shapes import SHAPES, Shape, write
+from tests.running import running
+
+REFUSED = {
+    "class": "is C++, and the locked compiler for robots is one for C only; generate C",
+    "c++": "is C++, and the locked compiler for robots is one for C only; generate C",
+    "solver": "generated/ lacks rtw_continuous.h: it is a header of MATLAB's own, which the model's options need; let",
+    "cmsis": "generated/ lacks arm_math.h: it is CMSIS, the library of ARM processors, and robots have none; generate",
+    "bus": "generated/plant.h: has a root port plant_U_measurements of type measurement; root ports are numbers or",
+}
+ACCEPTED = {name: shape for name, shape in SHAPES.items() if name not in REFUSED}
+SILENT = {
+    "main": Shape("as r2017b-main, with the model's names", reusable=True, parameters="main"),
+    "global": Shape("as global, with the model's names", reusable=True, parameters="global"),
+}
+"""Were taken once, and had other parameters than generated, set or tuned."""
+USED = ACCEPTED | {f"silent-{name}": shape for name, shape in SILENT.items()}
+OWN = {"Kp": 1.5, "Limit": 2.0, "Weights": [0.5, 1.0]}
+GENERATED = {"Kp": 2.5, "Limit": 10.0, "Weights": [0.25, -0.25]}
+BLOCK = "{name}: {{type: model, in: {{error: ramp.out, rates: [1, 2], enable: 1}}{more}}}"
+TASK = (
+    "period: 10 ms\npriority: 0\nblocks:\n  time: {{type: clock}}\n  ramp: {{type: gain, in: {{in: time.time}}}}\n{}\n"
+)
+STEPS = 23
+
+
+def test_there_are_as_many_as_were_found_and_most_are_accepted() -> None:
+    assert (len(SHAPES), len(ACCEPTED)) == (37, 32)
+
+
+@pytest.fixture
+def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """With this computer's compiler in place of the locked one."""
+
+    def command(directory: Path, _: str, argv: Sequence[str], *_run: object) -> None:
+        argv = [word.replace("/out", str(directory)) for word in argv]
+        done = subprocess.run(argv, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise UserError(done.stderr)
+
+    monkeypatch.setattr(runtime, "command", command)
+    monkeypatch.setattr(paths, "BUILD", tmp_path)
+    return tmp_path
+
+
+def build(shape: Shape, work: Path) -> Path:
+    """The directory of the plug-in."""
+    write(shape, work / "app" / ert.GENERATED)
+    return compiled(shape, work)
+
+
+def compiled(shape: Shape, work: Path) -> Path:
+    """The same, of code that was written."""
+    out, blocks = work / "source", work / "blocks"
+    ert.block(work / "app", shape.model, "model", [], out, "amd64")
+    blocks.mkdir()
+    options = [
+        "-std=c11",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-Wno-unused-parameter",
+        "-fvisibility=hidden",
+        "-shared",
+        "-fPIC",
+    ]
+    argv = ["cc", *options, f"-I{runtime.SOURCE / 'include'}", "-o", str(blocks / "model.so")]
+    done = subprocess.run([*argv, *map(str, sorted(out.glob("*.c")))], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return blocks
+
+
+def run(flotilla_run: Path, blocks: Path, task: str, watch: str, *options: str) -> subprocess.CompletedProcess[str]:
+    file = blocks.parent / "task.yml"
+    file.write_text(task)
+    argv = [str(flotilla_run), "--blocks", str(blocks), "--steps", str(STEPS), "--no-wait", "--watch", watch, *options]
+    return subprocess.run([*argv, str(file)], capture_output=True, text=True, timeout=60, check=False)
+
+
+def written(name: str, parameters: dict[str, object] | None = None) -> str:
+    return "  " + BLOCK.format(name=name, more=f", parameters: {json.dumps(parameters)}" if parameters else "")
+
+
+def response(errors: list[float], every: int, parameters: dict[str, object]) -> list[float]:
+    """What the shapes' model does."""
+    weights, limit, gain = parameters["Weights"], parameters["Limit"], parameters["Kp"]
+    assert isinstance(weights, list)
+    assert isinstance(limit, float)
+    assert isinstance(gain, float)
+    commands, total = [], 0.0
+    for step, error in enumerate(errors):
+        commands.append(max(-limit, min(limit, gain * error - (weights[0] * 1 + weights[1] * 2) + total)))
+        if step % every == 0:
+            total += 0.5 * error
+    return commands
+
+
+@pytest.mark.parametrize("shape", USED.values(), ids=USED.keys())
+def test_a_shape_does_what_the_model_does(flotilla_run: Path, work: Path, shape: Shape) -> None:
+    """As generated, and with parameters of the task file; two in one task, or the reason why not."""
+    blocks = build(shape, work)
+    variants = {"plain": GENERATED} | ({"tuned": OWN} if shape.tunable else {"other": GENERATED})
+    texts = [written(name, OWN if name == "tuned" else None) for name in variants]
+    command = "out" if shape.io == "custom" else "command"
+    groups = [[0], [1]] if shape.once else [[0, 1]]
+    for group in groups:
+        names = [list(variants)[i] for i in group]
+        watch = ",".join(["ramp.out", *(f"{name}.{command},{name}.count" for name in names)])
+        done = run(flotilla_run, blocks, TASK.format("\n".join(texts[i] for i in group)), watch)
+        assert done.returncode == 0, done.stderr
+        rows = [json.loads(line) for line in done.stdout.splitlines()]
+        errors = [row["ramp.out"] for row in rows]
+        assert len(rows) == STEPS
+        for name in names:
+            expected = response(errors, shape.every, variants[name])
+            assert [row[f"{name}.{command}"] for row in rows] == pytest.approx(expected)
+            assert [row[f"{name}.count"] for row in rows] == [1 + step // shape.every for step in range(STEPS)]
+    if shape.once:
+        done = run(flotilla_run, blocks, TASK.format("\n".join(texts)), "ramp.out", "--check")
+        said = r"the model has global variables \(.+\), so a task can have it once, and block plain is it; generate"
+        assert (done.returncode, bool(re.search(said, done.stderr))) == (2, True), done.stderr
+    if not shape.tunable:
+        done = run(flotilla_run, blocks, TASK.format(written("plain", OWN)), "ramp.out", "--check")
+        assert (done.returncode, "Kp" in done.stderr) == (2, True), done.stderr
+
+
+TUNABLE = {name: shape for name, shape in USED.items() if shape.tunable}
+
+
+@pytest.mark.parametrize("shape", TUNABLE.values(), ids=TUNABLE.keys())
+def test_a_shape_is_tuned_while_it_runs(flotilla_run: Path, work: Path, shape: Shape) -> None:
+    blocks, control = build(shape, work), work / "control"
+    argv: list[str | Path] = [flotilla_run, "--blocks", blocks, "--control", control, "--watch", "model.command"]
+    block = "  model: {type: model, in: {error: 0, rates: [1, 0], enable: 1}, parameters: {Weights: [-3, 0]}}"
+    with running(argv, work / "run.yml", TASK.format(block)) as task:
+        task.until(lambda row: row["command"] == 3)
+        param: list[str | Path] = [
+            flotilla_run.with_name("flotilla-param"),
+            "--control",
+            control,
+            "run",
+            "model.Limit",
+            "2",
+        ]
+        done = subprocess.run(param, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+        task.until(lambda row: row["command"] == 2)
+
+
+@pytest.mark.parametrize(("name", "said"), REFUSED.items(), ids=REFUSED.keys())
+def test_a_shape_that_cannot_be_a_block_is_refused_with_the_reason(work: Path, name: str, said: str) -> None:
+    with pytest.raises(UserError) as refused:
+        build(SHAPES[name], work)
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["r2024a", "r2014a-nested"])
+def test_a_model_that_reports_an_error_ends_the_task(flotilla_run: Path, work: Path, name: str) -> None:
+    shape = SHAPES[name]
+    write(shape, work / "app" / ert.GENERATED)
+    source = work / "app" / ert.GENERATED / "plant.c"
+    text = source.read_text()
+    failing = text.replace(
+        "  /* Outport: '<Root>/count' */", '  if (count_of_steps++ == 3) plant_M->errorStatus = "lost";'
+    )
+    assert failing != text
+    source.write_text(f"static int count_of_steps;\n{failing}")
+    done = run(flotilla_run, compiled(shape, work), TASK.format(written("plain")), "plain.command")
+    assert (done.returncode, "plain: lost" in done.stderr) == (1, True), done.stderr
+    assert len(done.stdout.splitlines()) == 3
+
+
+def test_types_of_another_size_than_their_names_say_are_refused(work: Path) -> None:
+    """As generated for another processor, without the coder's own check."""
+    write(SHAPES["r2024a"], work / "app" / ert.GENERATED)
+    types = work / "app" / ert.GENERATED / "rtwtypes.h"
+    types.write_text(types.read_text().replace("unsigned int uint32_T", "unsigned long uint32_T"))
+    with pytest.raises(
+        AssertionError, match="count is no uint32 here: generate the model for the processor of the robot"
+    ):
+        compiled(SHAPES["r2024a"], work)
+
+
+@pytest.mark.parametrize(("word_size", "accepted"), [("32", "i386"), ("64", "amd64")])
+def test_word_sizes_are_the_robots(fleet: Fleet, tmp_path: Path, word_size: str, accepted: str) -> None:
+    """By the locked compilers: the coder's own check of word sizes is made, and judges the robot's processor."""
+    directory = tmp_path / "model"
+    write(Shape("any", reusable=True, word_size=word_size), directory / ert.GENERATED)
+    (directory / app.FILE).write_text("kind: ert\nmodel: plant\n")
+    (directory / app.TASK).write_text(TASK.format(written("plain", OWN)).replace("priority: 0", "priority: 70"))
+    boards = {str(board.architecture): board for board in fleet.boards.values()}
+    assert set(boards) == {"i386", "amd64"}
+    builder.build(app.load(directory), boards.pop(accepted), tmp_path / "accepted")
+    assert (tmp_path / "accepted" / "blocks" / "model.so").is_file()
+    ((other, board),) = boards.items()
+    with pytest.raises(UserError, match=f"was generated for another size of ulong/long than {other} has; choose the"):
+        builder.build(app.load(directory), board, tmp_path / "refused")

@@ -1,0 +1,154 @@
+"""A further message is data: added to messages.yml, it goes from task to task by the real runtime and both
+transports, and into a recording that readers decode which share nothing with what wrote it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import struct
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flotilla.common import paths
+from flotilla.fleet import identity, inventory
+from flotilla.fleet.model import Fleet
+from flotilla.station import telemetry
+from flotilla.station.receiver import Receiver
+from flotilla.station.record import Recorder
+from tests.running import DDS_ON_LOOPBACK, PATIENCE, free_port, running
+from tests.station import decoded, on_loopback, pymcap
+
+MESSAGES = """
+probe:
+  sender: source
+  receiver: sink
+  port: {probe}
+  rate_hz: 100
+  deadline_ms: 1000
+  signals:
+    step: {{ type: uint64 }}
+    wide: {{ type: double, width: 3, unit: [s, m, "1"] }}
+    right: {{ type: boolean }}
+    small: {{ type: int16 }}
+
+sink-heard:
+  sender: sink
+  receiver: stations
+  port: {heard}
+  rate_hz: 50
+  every: 2
+  signals:
+    small: {{ type: int16 }}
+    step: {{ type: uint64 }}
+    wide: {{ type: double, width: 3, unit: [s, m, "1"] }}
+    fresh: {{ type: boolean }}
+    half: {{ type: double, unit: s }}
+"""
+SOURCE = """
+period: 10 ms
+priority: 0
+blocks:
+  clock: { type: clock }
+  wide: { type: join, in: { in0: clock.time, in1: -1.5, in2: 2 }, parameters: { inputs: 3 } }
+  message:
+    type: pack
+    in: { step: clock.step, wide: wide.out, right: 1, small: -7 }
+    parameters:
+{{ message("probe").layout }}
+  to_sink:
+{{ message("probe").send("message.out") }}
+"""
+SINK = """
+period: 10 ms
+priority: 0
+trigger: probe
+blocks:
+  probe:
+{{ message("probe").receive }}
+  in:
+    type: unpack
+    in: { in: probe.data }
+    parameters:
+{{ message("probe").layout }}
+  half: { type: gain, in: { in: "in.wide[0]" }, parameters: { factor: 0.5 } }
+  heard:
+    type: pack
+    every: {{ message("sink-heard").every }}
+    in: { small: in.small, step: in.step, wide: in.wide, fresh: probe.flag, half: half.out }
+    parameters:
+{{ message("sink-heard").layout }}
+  to_station:
+{{ message("sink-heard").send("heard.out") }}
+"""
+HEARD = struct.Struct("<hQ3d?d")
+MANY = 20
+"""Reports that are waited for."""
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    """One on loopback, whose robot 1 has the tasks `source` and `sink`."""
+    tasks = tmp_path / "control_tasks"
+    shutil.copytree(paths.TASKS, tasks)
+    with (tasks / paths.MESSAGES).open("a") as file:
+        file.write(MESSAGES.format(probe=free_port(), heard=free_port()))
+    (tasks / "source.yml").write_text(SOURCE)
+    (tasks / "sink.yml").write_text(SINK)
+    monkeypatch.setattr(paths, "TASKS", tasks)
+    described = inventory.load_fleet(on_loopback(tmp_path / "inventory", "127.0.0."))  # as robot 1's tasks send
+    robot = described.robots[1].model_copy(update={"control_tasks": ["source", "sink"]})
+    # Tests at the same time do not hear each other.
+    network = described.network.model_copy(update={"dds_domain": 1 + os.getpid() % 200, "udp_ports": ["1024-65535"]})
+    return described.model_copy(update={"robots": {1: robot}, "network": network})
+
+
+def by(transport: str, fleet: Fleet) -> Fleet:
+    return fleet.model_copy(update={"network": fleet.network.model_copy(update={"transport": transport})})
+
+
+@pytest.mark.parametrize("transport", ["udp", "dds"])
+def test_a_message_is_added_by_data_alone(transport: str, fleet: Fleet, flotilla_run: Path, tmp_path: Path) -> None:
+    """Seen to fail with big-endian numbers, with gaps in the layout, and with names in another order than types."""
+    fleet = by(transport, fleet)
+    texts = {name: task.decode() for name, task in identity.control_tasks(fleet, fleet.robots[1]).items()}
+    (stream,) = telemetry.streams(fleet)
+    assert (stream.topic, stream.length, stream.every) == ("/robot1/sink/heard", HEARD.size, 2)
+    file = tmp_path / "a.mcap"
+    receiver, recorder = Receiver([stream]), Recorder([stream], file)
+    receiver.sinks.append(recorder)
+    command: list[str | Path] = [flotilla_run, "--blocks", str(flotilla_run.parent)]
+    datagrams: list[tuple[Any, ...]] = []
+    with ExitStack() as stack:
+        station = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        station.bind(("127.0.0.254", stream.port))
+        station.settimeout(PATIENCE)
+        for name in ("sink", "source"):
+            environment = {"CYCLONEDDS_URI": DDS_ON_LOOPBACK}
+            stack.enter_context(running(command, tmp_path / f"{name}.yml", texts[name], environment))
+        while sum(fresh for *_, fresh, _ in datagrams) < MANY:
+            datagram, (address, _) = station.recvfrom(1 << 16)
+            receiver.take(datagram, address, stream.port, time.time_ns())
+            datagrams.append(HEARD.unpack(datagram))
+            assert len(datagrams) < 100 * MANY, receiver.summary
+    recorder.end()
+    # What blocks packed, unpacked and packed again.
+    for small, step, time_s, minus, two, fresh, half in datagrams:
+        if fresh:
+            assert (small, minus, two, half) == (-7, -1.5, 2, pytest.approx(time_s / 2))
+            periods = time_s / 0.01  # some may have been skipped
+            assert step <= round(periods) == pytest.approx(periods, abs=1e-6)
+    # What is recorded of it, by the file's own schema.
+    recorded = [
+        (message.small, message.step, *message.wide, message.fresh, message.half) for _, message in decoded(file)
+    ]
+    assert recorded == datagrams
+    (schema,) = json.loads(pymcap("info-json", file).stdout)["schemas"]
+    assert schema["name"] == "flotilla.SinkHeard"
+    doctor = pymcap("doctor", file)
+    assert doctor.returncode == 0, doctor.stdout

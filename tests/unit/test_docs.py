@@ -1,0 +1,107 @@
+"""What documents name exists: paths, links, targets of make, messages. Links within docs/ are Sphinx's to check."""
+
+from __future__ import annotations
+
+import fnmatch
+import functools
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from flotilla.common import paths
+
+TROUBLESHOOTING = paths.PROJECT / "docs" / "troubleshooting.md"
+OUTPUTS = ("build/", "apps/", "ansible/keys/")
+"""Where outputs, apps of one's own and keys go: not in git."""
+
+HEADERS = "runtime/include/"
+"""Where headers lie that are included as `flotilla/block.h`."""
+
+
+@functools.cache
+def tracked() -> tuple[str, ...]:
+    """Files of the checkout that git knows or would add, and their folders."""
+    argv = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(argv, cwd=paths.PROJECT, capture_output=True, text=True, check=True).stdout.splitlines()
+    files = [file for file in listed if (paths.PROJECT / file).exists()]
+    folders = {str(parent) for file in files for parent in Path(file).parents}
+    return (*files, *sorted(folders))
+
+
+def documents() -> list[str]:
+    return sorted(file for file in tracked() if file.endswith(".md"))
+
+
+def missing_paths(text: str) -> list[str]:
+    """Paths below a folder of the checkout that name nothing there. NAME and other capitals stand for anything."""
+    tops = {file.split("/", 1)[0] for file in tracked() if "/" in file}
+    pattern = rf"(?<![\w./{{}}*-])(?:{'|'.join(map(re.escape, sorted(tops)))})/[\w./*@-]*[\w*/]"
+    found = sorted(set(re.findall(pattern, text)))
+    return [path for path in found if not path.startswith(OUTPUTS) and not _exists(path)]
+
+
+def _exists(path: str) -> bool:
+    wanted = re.sub(r"\b(NAME|BOARD|AREA|KIND|NNNN)\b", "*", path.rstrip("/")).replace("board_NAME", "board_*")
+    return any(fnmatch.fnmatchcase(file, place + wanted) for place in ("", HEADERS) for file in tracked())
+
+
+def dead_links(text: str, folder: Path) -> list[str]:
+    """Relative targets of links and pictures that are not there."""
+    targets = [target.split("#", 1)[0] for target in re.findall(r"\]\(([^)\s]+)\)", text)]
+    relative = [target for target in targets if target and not re.match(r"[a-z]+:", target)]
+    return [target for target in relative if not (paths.PROJECT / folder / target).exists()]
+
+
+def unknown_targets(text: str) -> set[str]:
+    """What stands in code as `make TARGET`, and is not in `make help`."""
+    argv = ["make", "-C", str(paths.PROJECT), "help"]
+    shown = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
+    return set(re.findall(r"(?:`|^)(?:sudo )?make ([a-z-]+)", text, re.MULTILINE)) - set(
+        re.findall(r"^  ([a-z-]+) ", shown, re.MULTILINE)
+    )
+
+
+@functools.cache
+def sources() -> str:
+    """All that programs may say, in one text."""
+    kinds = (".py", ".c", ".h", ".sh", ".yml", ".j2", "init", "preinit", "grub.cfg.j2")
+    files = [file for file in tracked() if file.endswith(kinds) and not file.startswith(("docs/", "tests/"))]
+    return "\n".join((paths.PROJECT / file).read_text() for file in files if (paths.PROJECT / file).is_file())
+
+
+def unsaid(text: str) -> list[str]:
+    """Pieces of the messages in the first column of tables that no program says. Whatever differs is `…`."""
+    messages = re.findall(r"^\| (`.*?`) +\|", text, re.MULTILINE)
+    pieces = [piece.strip(" `:") for message in messages for piece in re.split(r"…|`", message)]
+    return [piece for piece in pieces if len(piece) > 3 and piece not in sources()]
+
+
+@pytest.mark.parametrize("document", documents())
+def test_what_a_document_names_exists(document: str) -> None:
+    text = (paths.PROJECT / document).read_text()
+    assert missing_paths(text) == []
+    assert dead_links(text, Path(document).parent) == []
+    assert unknown_targets(text) == set()
+
+
+def test_messages_of_troubleshooting_are_the_programs() -> None:
+    assert unsaid(TROUBLESHOOTING.read_text()) == []
+
+
+def test_the_interface_of_blocks_has_the_documented_number() -> None:
+    """Seen to fail with another number in the page."""
+    header = (paths.PROJECT / HEADERS / "flotilla" / "block.h").read_text()
+    page = (paths.PROJECT / "docs" / "reference" / "versions.md").read_text()
+    assert re.findall(r"`FL_ABI`, a number that is (\d+) now", page) == re.findall(r"#define FL_ABI (\d+)u", header)
+
+
+def test_each_check_sees_what_is_wrong() -> None:
+    wrong = "`docs/style.md` `docs/stile.md` [a](docs/style.md) [b](docs/stile.md) `make image` `make imgae`"
+    assert missing_paths(wrong) == ["docs/stile.md"]
+    assert missing_paths("ansible/inventory/group_vars/board_NAME.yml, images/packages/*.list, /docs/x, build/x") == []
+    assert missing_paths("kernel/fragments/NAME.confg") == ["kernel/fragments/NAME.confg"]
+    assert dead_links(wrong, Path()) == ["docs/stile.md"]
+    assert unknown_targets(wrong) == {"imgae"}
+    assert unsaid("| `no slot left, … all again` | |\n| `no slot right` | |\n") == ["no slot right"]
