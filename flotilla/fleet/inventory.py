@@ -126,8 +126,8 @@ def _ansible_inventory(directory: Path) -> str:
     except FileNotFoundError:
         raise UserError(f"{program}: not installed; run `make setup`") from None
     if done.returncode:
-        said = done.stderr.partition("Traceback")[0].strip()
-        raise UserError(f"{paths.shown(directory)}: Ansible cannot read the inventory:\n{said}")
+        message = done.stderr.partition("Traceback")[0].strip()
+        raise UserError(f"{paths.shown(directory)}: Ansible cannot read the inventory:\n{message}")
     return done.stdout
 
 
@@ -548,8 +548,8 @@ def _boards(raw: dict[str, Any]) -> Iterator[Finding]:
 
         # 8250.nr_uarts: Debian's kernels make 4 ports unless told so (SERIAL_8250_RUNTIME_UARTS) and 32 at most.
         arguments = " ".join(map(str, board.get("kernel_arguments", ())))
-        told = re.search(r"8250\.nr_uarts=(\d+)", arguments)
-        uarts = int(told[1]) if told else 4
+        limit = re.search(r"8250\.nr_uarts=(\d+)", arguments)
+        uarts = int(limit[1]) if limit else 4
         needed = 1 + max((int(tty[4:]) for tty in ttys.values() if tty.startswith("ttyS")), default=-1)
         if needed > uarts and "kernel_arguments" in board:
             loc = ("boards", name, "kernel_arguments")

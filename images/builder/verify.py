@@ -114,7 +114,7 @@ def verify(fleet: Fleet, robot: Robot, apps: Sequence[BuiltApp] = (), *, plant: 
 
 def far(log: str) -> progress.Far:
     """What the second build said last of its own parts."""
-    return progress.Far(said=next((line for line in reversed(log.splitlines()) if _ENDED.search(line)), ""))
+    return progress.Far(line=next((line for line in reversed(log.splitlines()) if _ENDED.search(line)), ""))
 
 
 @contextmanager

@@ -53,7 +53,7 @@ class Play:
 
     status: int
     wall_s: float
-    said: str
+    output: str
     robots: dict[str, dict[str, Any]]
     """By name, what its report says."""
 
@@ -66,7 +66,7 @@ class Play:
         } | {name: "was not reached" for name in names if name not in self.robots}
         if wrong or self.status:
             listed = "".join(f"\n{name}: {what}" for name, what in wrong.items())
-            raise LabError(f"fleet.yml ended with status {self.status}; not up to date were:{listed or self.said}")
+            raise LabError(f"fleet.yml ended with status {self.status}; not up to date were:{listed or self.output}")
 
 
 @dataclass(frozen=True)

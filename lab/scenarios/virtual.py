@@ -294,10 +294,10 @@ def fly(plans: Sequence[Plan], board: Board, out: Path) -> dict[str, Path]:
 def far(console: str, flights: Mapping[str, float]) -> progress.Far:
     """How far a session is whose guest has written `console`; `flights`: virtual seconds of each, in their order."""
     total = sum(flights.values())
-    told = re.findall(r"flight: (\S+) ([\d.e+]+) s\n", console)
-    if not told:
+    moments = re.findall(r"flight: (\S+) ([\d.e+]+) s\n", console)
+    if not moments:
         return progress.Far(0, total, "virtual seconds", part="boot")
-    name, passed = told[-1]
+    name, passed = moments[-1]
     names = list(flights)
     before = sum(flights[each] for each in names[: names.index(name)])
     return progress.Far(before + float(passed), total, "virtual seconds", part=name)
@@ -323,11 +323,11 @@ def run(there: Mapping[str, bytes], board: Board, out: Path, flights: Mapping[st
     with progress.step(title, lambda: far(progress.text(console), flights)):
         document = results.received(guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds))
     initrd.unlink()
-    said = json.loads(document["commands"]["session"])
-    for name, content in said["files"].items():
+    answer = json.loads(document["commands"]["session"])
+    for name, content in answer["files"].items():
         file = out / "flights" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(base64.b64decode(content))
-    if "error" in said:
-        raise UserError(f"the flight failed in the guest:\n{said['error'].strip()}")
+    if "error" in answer:
+        raise UserError(f"the flight failed in the guest:\n{answer['error'].strip()}")
     return out / "flights"
