@@ -192,8 +192,9 @@ meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
 runtime: | setup-tests ## the runtime's programs for this computer, in build/runtime
-	$(Q)test -f $(BUILD)/runtime/build.ninja || $(meson) setup $(BUILD)/runtime runtime >/dev/null
-	$(Q)$(call compile,$(BUILD)/runtime)
+	@# One after the other: processes that run tests ask for it at once.
+	$(Q)mkdir -p $(BUILD); flock $(BUILD)/.runtime.lock sh -e -c $(call quoted,test -f $(BUILD)/runtime/build.ninja || \
+	    $(meson) setup $(BUILD)/runtime runtime >/dev/null; $(call compile,$(BUILD)/runtime))
 
 check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
 	$(Q)$(step) "format of C" $(VENV)/bin/clang-format --dry-run -Werror $$(git ls-files '*.[ch]')
