@@ -502,7 +502,7 @@ class _Reader:
         return place
 
     def _is_input(self, parameter: Any, port: str, letter: str | None) -> bool:
-        """By its name as the coder makes it; else by C, where that tells; else by comments."""
+        """By its name as the coder makes it; else by its type in C; else by comments."""
         if letter:
             return letter == "U"
         if isinstance(parameter.type, c_ast.TypeDecl):

@@ -169,7 +169,7 @@ class Sources:
         return sorted({name for kind, name in self._entries if kind == "group_vars" and name.startswith("board_")})
 
     def described(self, board: str) -> Any:
-        """What `group_vars/` says of a board's group: Ansible tells variables of hosts only, and this may have none."""
+        """What `group_vars/` has of a board's group: Ansible lists variables of hosts only, and it may have none."""
         for entry in reversed(self._entries.get(("group_vars", board), [])):
             if found := child(entry.node, "board"):
                 return yaml.SafeLoader("").construct_document(found[1])

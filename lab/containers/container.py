@@ -89,7 +89,7 @@ def boot(
     """Boot the robots. Each then answers SSH at its own address, and this computer has the station's.
 
     `image`: a card image of their board. `log`: a directory for what their first programs say.
-    `booted` is told of each.
+    `booted` is called for each.
     """
     if os.getpid() != 1:
         raise ValueError("robots in containers need a process that the command of `inside` started")
@@ -237,7 +237,7 @@ def own_files(root: Path, board: Board) -> dict[str, str]:
 
 
 def _listen(path: Path) -> socket.socket:
-    """Where a robot's systemd tells that it has booted (sd_notify(3))."""
+    """The socket on which a robot's systemd reports that it has booted (sd_notify(3))."""
     notified = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     notified.bind(str(path))
     return notified

@@ -82,7 +82,7 @@ class Plan:
     standby: Mapping[str, str] = field(default_factory=dict)
     """Robots by name, and the control task for which each stands by."""
     second_station: bool = False
-    """A further station of the fleet hears what the first one hears, and says wrongly where the robot is."""
+    """A further station of the fleet receives what the first one does, and sends wrong positions of the robot."""
     stranger: bool = False
     """A computer that is not of the fleet sends to all ports of the control tasks, as often as they step."""
     changes: Mapping[str, object] = field(default_factory=dict)
@@ -169,7 +169,7 @@ def _own(template: str, **values: object) -> bytes:
 
 
 def station(described: Fleet) -> bytes:
-    """The station's task. It hears a stream of each task that sends one."""
+    """The station's task. It receives a stream of each task that sends one."""
     streams = {stream.task: stream for stream in telemetry.streams(described)}
     return _own("station.yml.j2", controllers=described.robots_with("control"), **streams)
 
