@@ -147,6 +147,9 @@ SignalName = Annotated[
 Word = Annotated[str, matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
 Architecture = Literal["i386", "amd64"]
 """Debian's names of the processor architectures that boards may have."""
+Processor = Annotated[
+    str, matching(r"[a-z0-9][a-z0-9._-]*", "is not a value of GCC's -march", "such as pentium3, see `man gcc`")
+]
 Module = Annotated[str, matching(r"[A-Za-z0-9_]+", "is not a kernel module's name", "such as ata_piix, without .ko")]
 
 
@@ -251,6 +254,9 @@ class Board(_Model):
     """The computer in one line, for reports."""
     architecture: Architecture
     """Debian's name of the processor architecture."""
+    processor: Processor | None = None
+    """Processor for which programs that measure the board are compiled: a value of GCC's `-march`. Leave it out for
+    the oldest one of the architecture."""
     kernel: Literal["debian", "lean"]
     """`debian`: Debian's real-time kernel. `lean`: the one that `make kernel` builds from `kernel/NAME.yml`."""
     kernel_arguments: list[Word]
