@@ -115,7 +115,7 @@ def guest(fleet: Fleet, session_artefacts: Path) -> Iterator[GuestFactory]:
                     booted[key] = error
             found = booted[key]
             if isinstance(found, BaseException):
-                raise found
+                raise found.with_traceback(None)  # each raise would lengthen it
             return found
 
         yield shared
