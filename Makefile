@@ -234,6 +234,10 @@ top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS
 param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
 	$(Q)$(FLOTILLA) param $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
 
+scope: | setup ## signals of a task that runs: ROBOT=1 TASK=heading [SIGNALS="gyro.rate"] [EVERY= ROWS= TRIGGER='gyro.rate>0.1' BEFORE=] [CSV=file]
+	$(Q)$(FLOTILLA) scope $(call need,ROBOT) $(call option,--every,EVERY) $(call option,--rows,ROWS) $(call option,--trigger,TRIGGER) \
+	    $(call option,--before,BEFORE) $(call option,--csv,CSV) -- $(call need,TASK) $(call each_given,SIGNALS)
+
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck scenarios scenarios-accept
 # What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.

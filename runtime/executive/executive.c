@@ -248,14 +248,14 @@ static void *control(void *argument)
         if (!options->no_wait)
             statistics_add(&result->jitter, begin_ns - release_ns);
         const struct fl_block *failed = schedule_step(executive->schedule, release_ns);
-        int64_t now_ns = fl_now_ns();
+        if (!failed && executive->scope)
+            scope_put(executive->scope, result->steps, release_ns);
+        int64_t now_ns = fl_now_ns(); /* what watchers cost counts as the step's */
         statistics_add(&result->step, now_ns - begin_ns);
         if (failed)
             end(result, failed->service->ended ? ENDING_DONE : ENDING_FAILED, failed, failed->service->failure);
         else if (executive->watch)
             sampler_put(executive->watch, result->steps, release_ns, options->no_wait);
-        if (!failed && executive->scope)
-            scope_put(executive->scope, result->steps, release_ns);
         result->steps++;
         if (failed)
             break;

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def test_each_step_has_a_row(running: Running) -> None:
     """Each row is of one step: what the integrator has and its gain agree. Seen to fail with rows taken twice."""
     found = rows(scope(running, "--rows", "50", "task", "time.out", "pair.out", "trigger.on"))
     assert len(found) == 50
-    for before, row in zip(found, found[1:], strict=False):
+    for before, row in pairwise(found):
         assert row["step"] == before["step"] + 1
     for row in found:
         assert row["pair.out"] == [2, 100 * row["time.out"]]

@@ -39,6 +39,7 @@ GIVEN = {
     "live": ["OUT", "SECONDS"],
     "top": ["OUT", "PORT"],
     "param": ["ROBOT", "TASK", "PARAM", "VALUE"],
+    "scope": ["ROBOT", "TASK", "EVERY", "ROWS", "TRIGGER", "BEFORE", "CSV"],
     "latency": ["BOARD", "KERNEL", "PLAN", "TARGET"],
     "latency-accept": ["BOARD", "KERNEL", "PLAN"],
     "boot-time": ["BOARD"],
