@@ -105,14 +105,15 @@ WATCHED = "\n".join(
 CLIENTS = 4
 """As many as may watch a task."""
 WATCH_ROWS = 1000
+_NAMES = " ".join(f"b{i}.out" for i in range(SIGNALS))
 # The clients come one after the other while the task runs, and are gone before it ends.
 WATCHING = f"""
 {{run}} --control /run/watched.control & task=$!
 until [ -S /run/watched.control ]; do sleep 0.01; done
 clients=
 for client in $(seq {CLIENTS}); do
-  flotilla-scope --control /run/watched.control --rows {WATCH_ROWS} watched {" ".join(f"b{i}.out" for i in range(SIGNALS))} \
-    >/run/watched.$client & clients="$clients $!"
+  flotilla-scope --control /run/watched.control --rows {WATCH_ROWS} watched {_NAMES} >/run/watched.$client &
+  clients="$clients $!"
 done
 for client in $clients; do wait $client || exit 1; done
 wait $task || exit 1

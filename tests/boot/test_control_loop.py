@@ -234,7 +234,7 @@ def test_signals_are_watched_from_the_station(loop: Loop, monkeypatch: pytest.Mo
     assert head == ["step", "release_ns", "lost", "gyro.rate", "gyro.flag"]
     steps = [int(row[0]) for row in rows]
     assert steps == list(range(steps[0], steps[0] + 100, 5))
-    with pytest.raises(UserError, match="robot1: task heading: gyro.rat: dsp3000 has no output rat; it has rate, "):
+    with pytest.raises(UserError, match=r"robot1: task heading: gyro\.rat: dsp3000 has no output rat; it has rate, "):
         scope.show(robot, scope.words("heading", ["gyro.rat"], csv=False, **options))  # type: ignore[arg-type]
 
 

@@ -36,7 +36,7 @@ def test_words_reach_the_robot_as_they_are(robot: Path, capfd: pytest.CaptureFix
     """Seen to fail with words that are joined by blanks: `>` made a file of the robot's."""
     program(robot, 'for word; do echo "<$word>"; done')
     options = {"every": 2, "rows": 3, "trigger": "a.b>-1", "before": 1}
-    scope.show(ROBOT, scope.words("heading", ["a.b", "c.d[1]"], csv=False, **options))  # type: ignore[arg-type]
+    scope.show(ROBOT, scope.words("heading", ["a.b", "c.d[1]"], csv=False, **options))
     assert capfd.readouterr().out.split() == [
         "<--every=2>", "<--rows=3>", "<--trigger=a.b>-1>", "<--before=1>", "<-->", "<heading>", "<a.b>", "<c.d[1]>"
     ]  # fmt: skip
