@@ -223,19 +223,21 @@ def test_parameters_are_set_from_the_station(loop: Loop, monkeypatch: pytest.Mon
     parameters.param(robot, "heading", "attitude.kp", str(file["kp"]))
 
 
+def watching(*signals: str) -> list[str]:
+    return scope.words("heading", signals, every=5, rows=20, trigger=None, before=None, csv=True)
+
+
 def test_signals_are_watched_from_the_station(loop: Loop, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """By the user who may log in, as the station does."""
     robot = loop.robot.robot
     monkeypatch.setattr(ssh, "forwarded_port", lambda _: loop.robot.machine.ssh_port())
-    options = {"every": 5, "rows": 20, "trigger": None, "before": None}
-    command = scope.words("heading", ["gyro.rate", "gyro.flag"], csv=True, **options)  # type: ignore[arg-type]
-    assert scope.record(robot, command, tmp_path / "rates.csv") == 20
+    assert scope.record(robot, watching("gyro.rate", "gyro.flag"), tmp_path / "rates.csv") == 20
     head, *rows = [line.split(",") for line in (tmp_path / "rates.csv").read_text().splitlines()]
     assert head == ["step", "release_ns", "lost", "gyro.rate", "gyro.flag"]
     steps = [int(row[0]) for row in rows]
     assert steps == list(range(steps[0], steps[0] + 100, 5))
     with pytest.raises(UserError, match=r"robot1: task heading: gyro\.rat: dsp3000 has no output rat; it has rate, "):
-        scope.show(robot, scope.words("heading", ["gyro.rat"], csv=False, **options))  # type: ignore[arg-type]
+        scope.show(robot, watching("gyro.rat"))
 
 
 def test_parameters_are_the_users_of_the_task_alone(loop: Loop) -> None:

@@ -16,7 +16,7 @@ from flotilla.fleet.model import Robot
 from flotilla.robot import scope, ssh
 
 ROBOT = Robot(name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"))
-ALL = {"every": None, "rows": None, "trigger": None, "before": None}
+COMMAND = scope.words("heading", ["a.b"], csv=True, every=None, rows=None, trigger=None, before=None)
 
 
 @pytest.fixture
@@ -35,8 +35,8 @@ def program(directory: Path, script: str) -> None:
 def test_words_reach_the_robot_as_they_are(robot: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Seen to fail with words that are joined by blanks: `>` made a file of the robot's."""
     program(robot, 'for word; do echo "<$word>"; done')
-    options = {"every": 2, "rows": 3, "trigger": "a.b>-1", "before": 1}
-    scope.show(ROBOT, scope.words("heading", ["a.b", "c.d[1]"], csv=False, **options))
+    command = scope.words("heading", ["a.b", "c.d[1]"], csv=False, every=2, rows=3, trigger="a.b>-1", before=1)
+    scope.show(ROBOT, command)
     assert capfd.readouterr().out.split() == [
         "<--every=2>", "<--rows=3>", "<--trigger=a.b>-1>", "<--before=1>", "<-->", "<heading>", "<a.b>", "<c.d[1]>"
     ]  # fmt: skip
@@ -45,22 +45,21 @@ def test_words_reach_the_robot_as_they_are(robot: Path, capfd: pytest.CaptureFix
 def test_rows_are_kept_and_a_file_without_rows_is_not(robot: Path, tmp_path: Path) -> None:
     file = tmp_path / "out.csv"
     file.write_text("former")
-    command = scope.words("heading", ["a.b"], csv=True, **ALL)  # type: ignore[arg-type]
     program(robot, "echo step,a.b; echo 'flotilla-scope: task heading has ended' >&2; exit 1")
     with pytest.raises(UserError, match=r"^robot3: task heading has ended$"):
-        scope.record(ROBOT, command, file)
+        scope.record(ROBOT, COMMAND, file)
     assert file.read_text() == "former"
     program(robot, "echo step,a.b; echo 9,8; echo 'flotilla-scope: task heading has ended' >&2; exit 1")
     with pytest.raises(UserError, match=r"^robot3: task heading has ended$"):
-        scope.record(ROBOT, command, file)
+        scope.record(ROBOT, COMMAND, file)
     assert file.read_text() == "step,a.b\n9,8\n"
     program(robot, "echo step,a.b; echo 1,2; echo 2,3")
-    assert scope.record(ROBOT, command, file) == 2
+    assert scope.record(ROBOT, COMMAND, file) == 2
     assert file.read_text() == "step,a.b\n1,2\n2,3\n"
     with pytest.raises(
         UserError, match=r"nowhere/out.csv: No such file or directory; name a file that can be written$"
     ):
-        scope.record(ROBOT, command, tmp_path / "nowhere" / "out.csv")
+        scope.record(ROBOT, COMMAND, tmp_path / "nowhere" / "out.csv")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flotilla-scope", "out.csv"]
 
 
@@ -68,9 +67,9 @@ INTERRUPTED = """
 import sys
 from pathlib import Path
 from flotilla.robot import scope, ssh
-from tests.unit.test_scope import ALL, ROBOT
+from tests.unit.test_scope import COMMAND, ROBOT
 ssh.command = lambda _: ["sh", "-c", 'PATH="$0:$PATH" exec sh -c "$1"', sys.argv[1]]
-print(scope.record(ROBOT, scope.words("heading", ["a.b"], csv=True, **ALL), Path(sys.argv[2])))
+print(scope.record(ROBOT, COMMAND, Path(sys.argv[2])))
 """
 
 
