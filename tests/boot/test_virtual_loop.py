@@ -75,8 +75,7 @@ def test_two_rates_on_one_computer_keep_their_time(said: dict[str, str]) -> None
 
 
 def test_who_watches_a_task_costs_it_little_and_no_step(said: dict[str, str]) -> None:
-    """Four clients with eight signals each at 1 kHz, each step of the task. Seen to fail with clients that make the
-    control thread wait for room."""
+    """Four clients with eight signals each at 1 kHz, each step of the task."""
     alone, watched = read(said["task_alone"]), read(said["task_watched"])
     assert (alone["overruns"], watched["overruns"]) == (0, 0)
     assert alone["step"]["count"] == watched["step"]["count"] == SECONDS * 1000

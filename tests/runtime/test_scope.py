@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import signal
 import socket
 import subprocess
 from collections.abc import Callable, Iterator
@@ -101,6 +100,7 @@ def test_a_crossing_is_waited_for(running: Running) -> None:
 
 
 def test_what_is_past_the_value_already_is_no_crossing(running: Running) -> None:
+    """Seen to fail without a look at the row before."""
     waiting = subprocess.Popen(
         argv(running, "--rows", "1", "--trigger", "a.out<3", "task", "time.out"), stdout=subprocess.PIPE, text=True
     )
@@ -182,16 +182,10 @@ def test_a_client_that_does_not_read_delays_nobody(running: Running) -> None:
         running.end()
 
 
-def test_the_last_rows_are_sent_when_the_task_ends(running: Running) -> None:
-    waiting = subprocess.Popen(
-        argv(running, "task", "time.out"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert waiting.stdout
-    out = waiting.stdout.readline()
-    running.process.send_signal(signal.SIGTERM)
-    out += waiting.stdout.read()
-    _, err = waiting.communicate(timeout=SECONDS)
-    printed, _ = running.process.communicate(timeout=SECONDS)
-    last = json.loads(printed.splitlines()[-1])["step"]
-    assert json.loads(out.splitlines()[-1])["step"] == last
-    assert (waiting.returncode, err) == (1, "flotilla-scope: task task has ended\n")
+def test_the_last_rows_are_sent_when_the_task_ends(flotilla_run: Path, tmp_path: Path) -> None:
+    """Seen to fail where the stream ends at once."""
+    running = Running(flotilla_run, tmp_path, "--steps", "200", more=MORE)
+    done = scope(running, "task", "time.out")
+    running.process.communicate(timeout=SECONDS)
+    assert (done.returncode, done.stderr) == (1, "flotilla-scope: task task has ended\n")
+    assert json.loads(done.stdout.splitlines()[-1])["step"] == 199
