@@ -95,8 +95,12 @@ static bool parse_word(const struct parsing *parsing, char *word)
         return parse_count(parsing, word, value, 1, &stream->every);
     if (strcmp(word, "rows") == 0)
         return parse_count(parsing, word, value, 0, &stream->rows);
-    if (strcmp(word, "before") == 0)
-        return parse_count(parsing, word, value, 0, &stream->before);
+    if (strcmp(word, "before") == 0) {
+        uint64_t before = 0;
+        bool good = parse_count(parsing, word, value, 0, &before);
+        stream->before = (size_t)before;
+        return good;
+    }
     if (strcmp(word, "trigger") == 0)
         return parse_trigger(parsing, value);
     return refuse(parsing, "%s: unknown; known are every, rows, csv, trigger and before", word);
@@ -119,10 +123,9 @@ static bool is_consistent(const struct parsing *parsing)
     if (stream->trigger.wanted && !stream->rows)
         stream->rows = stream->before + TRIGGERED_ROWS;
     if (stream->trigger.wanted && stream->before >= stream->rows)
-        return refuse(parsing, "before=%" PRIu64 " leaves no row of %" PRIu64 " for the trigger", stream->before,
-                      stream->rows);
+        return refuse(parsing, "before=%zu leaves no row of %" PRIu64 " for the trigger", stream->before, stream->rows);
     if (stream->before > STREAM_BEFORE_BYTES / stream->row_bytes)
-        return refuse(parsing, "before=%" PRIu64 ": at most %zu rows of these signals are held", stream->before,
+        return refuse(parsing, "before=%zu: at most %zu rows of these signals are held", stream->before,
                       STREAM_BEFORE_BYTES / stream->row_bytes);
     return true;
 }
@@ -172,7 +175,7 @@ static bool take_row(struct stream *stream, const struct row *row, FILE *out)
         return true;
     }
     stream->trigger.wanted = false;
-    for (uint64_t i = 0; i < stream->before; i++) {
+    for (size_t i = 0; i < stream->before; i++) {
         size_t at = (stream->next + i) % stream->before;
         write_row(stream, (const struct row *)(const void *)(stream->past + at * stream->row_bytes), out);
     }
@@ -275,7 +278,7 @@ bool stream_begin(struct streams *streams, struct scope *scope, const struct tas
         return false;
     stream->past = malloc(stream->before ? stream->before * stream->row_bytes : 1);
     if (!stream->past)
-        return refuse(&parsing, "there is no memory for %" PRIu64 " rows", stream->before);
+        return refuse(&parsing, "there is no memory for %zu rows", stream->before);
     stream->sampler = sampler_create(stream->watched, stream->count);
     stream->slot = scope_attach(scope, stream->sampler, (uint32_t)stream->every);
     stream->begun = true;

@@ -29,7 +29,7 @@ struct stream {
         size_t which;
         double value;
     } trigger;
-    uint64_t before, held; /* rows to be held before the trigger, and how many are */
+    size_t before, held; /* rows to be held before the trigger, and how many are */
     size_t next, row_bytes;
     unsigned char *past; /* these rows, a circle */
 };
