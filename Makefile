@@ -192,8 +192,9 @@ meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
 runtime: | setup-tests ## the runtime's programs for this computer, in build/runtime
-	$(Q)test -f $(BUILD)/runtime/build.ninja || $(meson) setup $(BUILD)/runtime runtime >/dev/null
-	$(Q)$(call compile,$(BUILD)/runtime)
+	@# One after the other: processes that run tests ask for it at once.
+	$(Q)mkdir -p $(BUILD); flock $(BUILD)/.runtime.lock sh -e -c $(call quoted,test -f $(BUILD)/runtime/build.ninja || \
+	    $(meson) setup $(BUILD)/runtime runtime >/dev/null; $(call compile,$(BUILD)/runtime))
 
 check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
 	$(Q)$(step) "format of C" $(VENV)/bin/clang-format --dry-run -Werror $$(git ls-files '*.[ch]')
@@ -272,17 +273,19 @@ $(VENV)/.installed: $(VENV)/.complete pyproject.toml
 setup-tests: setup ## install what testing needs
 	$(Q)images/install-host-packages tests/host-packages.txt
 
+# pip brings uv alone: that installs all others in a quarter of pip's time.
+new_venv = python3 -m venv $(VENV); sed -n '/^uv==/,/[^\\]$$/p' requirements.lock >$(VENV)/uv.lock; \
+    $(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r $(VENV)/uv.lock; \
+    $(uv_install) --only-binary :all: -r requirements.lock; \
+    $(uv_install) --no-deps --no-build-isolation -r requirements-source.lock
 uv_install = $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes
 $(VENV)/.complete: requirements.lock requirements-source.lock images/host-packages.txt
 	$(Q)images/install-host-packages images/host-packages.txt
-	$(Q)rm -rf $(VENV)
-	$(Q)python3 -m venv $(VENV)
-	@# pip brings uv alone: that installs all others in a quarter of pip's time.
-	$(Q)sed -n '/^uv==/,/[^\\]$$/p' requirements.lock >$(VENV)/uv.lock
-	$(Q)$(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r $(VENV)/uv.lock
-	$(Q)$(uv_install) --only-binary :all: -r requirements.lock
-	$(Q)$(uv_install) --no-deps --no-build-isolation -r requirements-source.lock
-	$(Q)touch $@
+	@# The last good one comes back where the new one fails. It cannot be made beside: its programs name its place.
+	$(Q)set -e; test ! -e $@ || { rm -rf $(VENV).before; mv $(VENV) $(VENV).before; }; \
+	    trap 'test -e $@ || test ! -e $(VENV).before || { rm -rf $(VENV); mv $(VENV).before $(VENV); }' EXIT; \
+	    trap 'exit 1' HUP INT TERM; \
+	    rm -rf $(VENV); $(new_venv); touch $@; rm -rf $(VENV).before
 
 clean: ## remove all outputs; keys stay
 	$(Q)rm -rf $(BUILD)

@@ -126,8 +126,8 @@ def _ansible_inventory(directory: Path) -> str:
     except FileNotFoundError:
         raise UserError(f"{program}: not installed; run `make setup`") from None
     if done.returncode:
-        said = done.stderr.partition("Traceback")[0].strip()
-        raise UserError(f"{paths.shown(directory)}: Ansible cannot read the inventory:\n{said}")
+        message = done.stderr.partition("Traceback")[0].strip()
+        raise UserError(f"{paths.shown(directory)}: Ansible cannot read the inventory:\n{message}")
     return done.stdout
 
 
@@ -169,7 +169,7 @@ class Sources:
         return sorted({name for kind, name in self._entries if kind == "group_vars" and name.startswith("board_")})
 
     def described(self, board: str) -> Any:
-        """What `group_vars/` says of a board's group: Ansible tells variables of hosts only, and this may have none."""
+        """What `group_vars/` has of a board's group: Ansible lists variables of hosts only, and it may have none."""
         for entry in reversed(self._entries.get(("group_vars", board), [])):
             if found := child(entry.node, "board"):
                 return yaml.SafeLoader("").construct_document(found[1])
@@ -548,8 +548,8 @@ def _boards(raw: dict[str, Any]) -> Iterator[Finding]:
 
         # 8250.nr_uarts: Debian's kernels make 4 ports unless told so (SERIAL_8250_RUNTIME_UARTS) and 32 at most.
         arguments = " ".join(map(str, board.get("kernel_arguments", ())))
-        told = re.search(r"8250\.nr_uarts=(\d+)", arguments)
-        uarts = int(told[1]) if told else 4
+        limit = re.search(r"8250\.nr_uarts=(\d+)", arguments)
+        uarts = int(limit[1]) if limit else 4
         needed = 1 + max((int(tty[4:]) for tty in ttys.values() if tty.startswith("ttyS")), default=-1)
         if needed > uarts and "kernel_arguments" in board:
             loc = ("boards", name, "kernel_arguments")

@@ -172,13 +172,13 @@ def run(board: Board, out: Path) -> dict[str, str]:
     guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=CAN_BOARDS)
     document = results.received(guest.run(out, 600))
     initrd.unlink()
-    said: dict[str, str] = document["commands"]
-    return said
+    outputs: dict[str, str] = document["commands"]
+    return outputs
 
 
-def chain(said: dict[str, str]) -> Latency:
+def chain(outputs: dict[str, str]) -> Latency:
     """From the first byte's write to the port, through line, driver, controller and relay board's I/O port."""
-    return _latency(json.loads(said["chain"])["histogram_us"])
+    return _latency(json.loads(outputs["chain"])["histogram_us"])
 
 
 def check(found: Latency, file: Path = BASELINE) -> None:

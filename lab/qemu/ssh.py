@@ -50,13 +50,13 @@ class Ssh:
         """Wait until the robot lets us in; a refused key or host key is reported at once."""
         deadline = Deadline(timeout)
         while not deadline.expired:
-            said = self._try_to_connect(deadline)
-            if said is None:
+            reason = self._try_to_connect(deadline)
+            if reason is None:
                 return
-            if any(phrase in said for phrase in HOPELESS):
-                raise LabError(f"{self._robot.name}: SSH refused: {said}")
+            if any(phrase in reason for phrase in HOPELESS):
+                raise LabError(f"{self._robot.name}: SSH refused: {reason}")
             time.sleep(RETRY_SECONDS)  # nothing tells from outside when a robot starts to listen
-        raise Expired(f"{self._robot.name}: no SSH within {timeout:g} s: {said}")
+        raise Expired(f"{self._robot.name}: no SSH within {timeout:g} s: {reason}")
 
     def run(
         self, argv: Sequence[str], *, timeout: float = 60, check: bool = True, stdin: str = ""
@@ -83,30 +83,30 @@ class Ssh:
         one = f"{{ errors=$(sh -c {shlex.quote(text)} 2>&1 >&3 3>&- </dev/null); }} 3>&1"
         self._root.stdin.write(f"{one}; printf '\\n%s %d\\n%s\\n%s\\n' {mark} $? \"$errors\" {mark}\n")
         self._root.stdin.flush()
-        said = self._said_by_root(f"\n{mark}\n", text, deadline)
-        output, _, rest = said.partition(f"\n{mark} ")
+        answer = self._output_of_root(f"\n{mark}\n", text, deadline)
+        output, _, rest = answer.partition(f"\n{mark} ")
         status, _, errors = rest.partition("\n")
         result = subprocess.CompletedProcess(["sh", "-c", text], int(status), output, errors)
         if check and result.returncode:
             raise LabError(f"{self._robot.name}: {text}: status {status}\n{output}{errors}")
         return result
 
-    def _said_by_root(self, end: str, text: str, deadline: Deadline) -> str:
-        """What the shell of root says, up to its end."""
+    def _output_of_root(self, end: str, text: str, deadline: Deadline) -> str:
+        """Output of root's shell, up to `end`."""
         assert self._root
         assert self._root.stdout
-        said = b""
+        output = b""
         with selectors.DefaultSelector() as selector:
             selector.register(self._root.stdout, selectors.EVENT_READ)
-            while not said.endswith(end.encode()):
+            while not output.endswith(end.encode()):
                 ready = selector.select(deadline.left)
                 more = os.read(self._root.stdout.fileno(), 1 << 16) if ready else b""
                 if not more:
                     self._leave_root()
                     why = "the connection ended" if ready else f"no end within {deadline.seconds:g} s"
-                    raise (LabError if ready else Expired)(f"{self._robot.name}: {text}: {why}\n{_text(said)}")
-                said += more
-        return _text(said).removesuffix(end)
+                    raise (LabError if ready else Expired)(f"{self._robot.name}: {text}: {why}\n{_text(output)}")
+                output += more
+        return _text(output).removesuffix(end)
 
     def _leave_root(self) -> None:
         if self._root:

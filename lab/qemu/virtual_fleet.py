@@ -147,15 +147,15 @@ def status() -> str:
 def down() -> str:
     """End the virtual fleet, be it still starting, and remove what it left."""
     ended = "no virtual fleet runs"
-    told = False
+    signalled = False
     deadline = time.monotonic() + DOWN_SECONDS
     while (lock := _free_lock()) is None:
-        if not told and (holder := _LOCK.read_text()):
+        if not signalled and (holder := _LOCK.read_text()):
             ports = _written_ports()
             ended = f"{len(ports)} guests ended" if ports else "the virtual fleet ended before it had started"
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(int(holder), signal.SIGTERM)
-            told = True
+            signalled = True
         if time.monotonic() > deadline:
             raise UserError(
                 f"the virtual fleet did not end within {DOWN_SECONDS} s; process {_LOCK.read_text()} holds it"
