@@ -322,6 +322,19 @@ def _top_arguments(parser: argparse.ArgumentParser) -> None:
     command.top_arguments(parser)
 
 
+def _report(arguments: argparse.Namespace) -> None:
+    from flotilla.common import paths
+    from flotilla.station import report
+
+    page = arguments.out or paths.BUILD / "reports" / f"{arguments.file.stem}.html"
+    print(f"{paths.shown(report.write(arguments.file, page))}: a page of {paths.shown(arguments.file)}")
+
+
+def _report_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="a recording of `make record`")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the page (build/reports/NAME.html)")
+
+
 def _provision(arguments: argparse.Namespace) -> None:
     from flotilla.robot import playbook
 
@@ -371,6 +384,7 @@ COMMANDS = (
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
     Command("Shell", "completion", "print what makes a shell complete these words", _completion,

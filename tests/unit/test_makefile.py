@@ -38,6 +38,7 @@ GIVEN = {
     "record": ["PORT", "SECONDS", "ADDRESS"],
     "live": ["OUT", "SECONDS"],
     "top": ["OUT", "PORT"],
+    "report": ["FILE", "OUT"],
     "param": ["ROBOT", "TASK", "PARAM", "VALUE"],
     "scope": ["ROBOT", "TASK", "EVERY", "ROWS", "TRIGGER", "BEFORE", "CSV"],
     "latency": ["BOARD", "KERNEL", "PLAN", "TARGET"],
