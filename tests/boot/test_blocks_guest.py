@@ -472,6 +472,7 @@ test_a_drive_that_lost_its_power_comes_back = can.test_a_drive_that_lost_its_pow
 test_udp_from_task_to_task = io.test_udp_from_task_to_task
 test_queue_between_two_rates = io.test_queue_between_two_rates
 test_a_topic_between_two_tasks = dds.test_a_topic_between_two_tasks
+test_a_message_of_ros_between_two_tasks = dds.test_a_message_of_ros_between_two_tasks
 
 # --- signals ---
 
@@ -529,6 +530,7 @@ def test_every_block_is_tested(lab: DeviceBench) -> None:
         test_udp_from_task_to_task: io.SENDER + io.RECEIVER,
         test_queue_between_two_rates: io.QUEUE_SENDER + io.QUEUE_RECEIVER,
         test_a_topic_between_two_tasks: dds.SENDER + dds.RECEIVER,
+        test_a_message_of_ros_between_two_tasks: dds.ROS_SENDER + dds.ROS_RECEIVER,
         test_signals_are_those_of_this_computer: SIGNALS,
         test_recording_is_read_back: signals.RECORDED,
     }
