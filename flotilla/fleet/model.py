@@ -450,6 +450,18 @@ class Signal(_Model):
     The name of an integer says its unit, such as `sensed_ns`."""
 
 
+class Drawn(_Model):
+    """A message of Foxglove's that is made of a message's signals, so that viewers draw it."""
+
+    type: Word
+    """Foxglove's schema, such as `PoseInFrame` or `LaserScan`."""
+    constants: dict[str, Any] = {}
+    """Members that never change, as in JSON: `{ frame_id: fleet }`."""
+    signals: dict[str, Word] = {}
+    """Signals by member: `pose.position.x: "state[0]"`. A quaternion takes a heading in rad, a timestamp an int64 in
+    ns; without a signal it is the time of reception."""
+
+
 class Message(_Model):
     """What one control task sends to another, or to the stations: one entry of `ansible/control_tasks/messages.yml`.
 
@@ -473,6 +485,8 @@ class Message(_Model):
     """`true`: another robot may be a hot standby for the sender."""
     charge: SignalName | None = None
     """Signal that is a battery's state of charge, 0 to 1. `make top` shows it."""
+    foxglove: dict[SignalName, Drawn] = {}
+    """What viewers draw of it, by name: `pose` of `control-report` becomes the topic `/robot3/control/report/pose`."""
     signals: dict[SignalName, Signal]
     """The values, in the order of their bytes."""
 

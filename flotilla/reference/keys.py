@@ -18,7 +18,7 @@ from flotilla.reference.markdown import MADE, code, table
 from images.builder import card, kernel, lock
 
 _PLAIN = {
-    bool: "boolean", int: "integer", float: "number", str: "string", IPv4Address: "IPv4 address",
+    Any: "anything", bool: "boolean", int: "integer", float: "number", str: "string", IPv4Address: "IPv4 address",
     IPv4Network: "IPv4 network",
 }  # fmt: skip
 
