@@ -181,11 +181,16 @@ double wheeled_nearest(const struct wheeled *robot)
     return nearest - robot->parameters.body_radius;
 }
 
-/* A wall takes the speed of what runs into it. */
-static void touch(struct wheeled *robot, double before)
+/* A wall takes the speed of what runs into it, and stays where it is. */
+static void touch(struct wheeled *robot, const double before[2])
 {
-    double nearest = wheeled_nearest(robot);
-    bool into = nearest < 0 && nearest < before;
+    double nearest = wheeled_nearest(robot), x = robot->pose[0], y = robot->pose[1];
+    memcpy(robot->pose, before, 2 * sizeof *before);
+    bool into = nearest < 0 && nearest < wheeled_nearest(robot);
+    if (!into) {
+        robot->pose[0] = x;
+        robot->pose[1] = y;
+    }
     robot->least = fmin(robot->least, nearest);
     if (into) {
         robot->contacts += !robot->touching;
@@ -218,12 +223,12 @@ bool wheeled_advance(struct wheeled *robot, int64_t duration_ns, const struct wh
 {
     if (duration_ns < 0 || duration_ns > WHEELED_LONGEST_NS)
         return false;
-    double nearest = wheeled_nearest(robot);
+    const double before[2] = {robot->pose[0], robot->pose[1]};
     for (int64_t left_ns = duration_ns; left_ns > 0; left_ns -= SUBSTEP_NS)
         move(robot, demand, 1e-9 * (double)(left_ns < SUBSTEP_NS ? left_ns : SUBSTEP_NS));
     robot->now_ns += duration_ns;
     if (duration_ns > 0)
-        touch(robot, nearest);
+        touch(robot, before);
     return true;
 }
 

@@ -14,7 +14,7 @@ struct robot {
 /* As doubles in the order of wheeled_ranges: who writes the task has them from a file, by name. */
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct robot, figures, .summary = "the parameters of wheeled.h, in its order"),
-    FL_PARAMETER(struct robot, walls, .default_value = "[]", .unit = "m", .summary = "x, y of the ends of each"),
+    FL_PARAMETER(struct robot, walls, .default_value = "", .unit = "m", .summary = "x, y of the ends of each"),
     FL_PARAMETER(struct robot, scan_period, .default_value = "0.1", .min = 1e-3, .max = 10, .unit = "s"),
     FL_PARAMETER(struct robot, cluster, .default_value = "1", .min = 1, .max = WHEELED_STEPS,
                  .summary = "steps that make one of `ranges`, the shortest of them"),
