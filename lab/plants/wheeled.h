@@ -33,28 +33,28 @@ enum { WHEELED_STEPS = WHEELED_LAST - WHEELED_FIRST + 1 };
 
 /* Doubles alone; `wheeled_ranges` says what each may be. */
 struct wheeled_parameters {
-    double mass;            /* of the whole robot */
-    double inertia;         /* about the vertical axis through the axle's middle, where the centre of mass is */
-    double body_radius;     /* of the disc that covers it */
+    double mass;        /* of the whole robot */
+    double inertia;     /* about the vertical axis through the axle's middle, where the centre of mass is */
+    double body_radius; /* of the disc that covers it */
     double wheel_radius;
-    double track;           /* from wheel to wheel */
-    double wheel_inertia;   /* of a wheel with gear and motor, as seen at the wheel */
-    double wheel_torque;    /* most of a drive, at the wheel */
-    double wheel_damping;   /* N·m·s, of gear and motor */
-    double grip;            /* μ between wheel and floor */
-    double wheel_load;      /* share of the weight on the two wheels; castors carry the rest */
-    double slip_speed;      /* at which tanh(1) of the grip is used */
-    double rolling;         /* N, resistance of castors and wheels */
-    double boom_inertia;    /* at the gear's output */
-    double boom_torque;     /* most of the drive */
-    double boom_load;       /* N·m against extension */
-    double boom_damping;    /* N·m·s */
-    double boom_end;        /* rad of the gear's output at full extension; 0: retracted */
-    double lag;             /* s, of the drives' speed loop */
-    double position_gain;   /* 1/s, of the drives' position loop */
-    double counts_per_rad;  /* of the encoders, at the gears' output */
-    double scanner_x;       /* ahead of the axle's middle */
-    double range_noise;     /* standard deviation of a range, at least */
+    double track;          /* from wheel to wheel */
+    double wheel_inertia;  /* of a wheel with gear and motor, as seen at the wheel */
+    double wheel_torque;   /* most of a drive, at the wheel */
+    double wheel_damping;  /* N·m·s, of gear and motor */
+    double grip;           /* μ between wheel and floor */
+    double wheel_load;     /* share of the weight on the two wheels; castors carry the rest */
+    double slip_speed;     /* at which tanh(1) of the grip is used */
+    double rolling;        /* N, resistance of castors and wheels */
+    double boom_inertia;   /* at the gear's output */
+    double boom_torque;    /* most of the drive */
+    double boom_load;      /* N·m against extension */
+    double boom_damping;   /* N·m·s */
+    double boom_end;       /* rad of the gear's output at full extension; 0: retracted */
+    double lag;            /* s, of the drives' speed loop */
+    double position_gain;  /* 1/s, of the drives' position loop */
+    double counts_per_rad; /* of the encoders, at the gears' output */
+    double scanner_x;      /* ahead of the axle's middle */
+    double range_noise;    /* standard deviation of a range, at least */
     double range_noise_relative;
     double initial_pose[3]; /* m, m, rad */
     double seed;            /* a whole number */
@@ -90,13 +90,13 @@ struct wheeled {
     double pose[3];     /* x m, y m, heading rad */
     double speed, rate; /* of the body: m/s ahead, rad/s */
     struct wheeled_axis axis[WHEELED_AXES];
-    double slip[2];      /* m/s, of each wheel on the floor */
-    uint32_t contacts;   /* how often it has run into a wall */
-    double impact;       /* m/s, the fastest of these */
-    double least;        /* m, between body and nearest wall, the least so far */
+    double slip[2];    /* m/s, of each wheel on the floor */
+    uint32_t contacts; /* how often it has run into a wall */
+    double impact;     /* m/s, the fastest of these */
+    double least;      /* m, between body and nearest wall, the least so far */
     bool touching;
-    double work, lost;   /* J: by the wheels' drives; in slip, damping, rolling and impacts */
-    uint64_t stream;     /* of random numbers */
+    double work, lost; /* J: by the wheels' drives; in slip, damping, rolling and impacts */
+    uint64_t stream;   /* of random numbers */
 };
 
 /* False with the reason when parameters or walls, `count` of them, cannot be. */

@@ -31,7 +31,7 @@ def names() -> dict[str, int]:
     return {name: int(count or 1) for name, count in members}
 
 
-def figures(file: Path = ROBOT, **changes: float | Sequence[float]) -> list[float]:
+def figures(file: Path = ROBOT, /, **changes: float | Sequence[float]) -> list[float]:
     """The parameters of a file but for `changes`, as the block wheeled-robot takes them; UserError says what is wrong
     with either. What a number may be is the block's to say."""
     values = _mapping(file) | changes
@@ -68,7 +68,7 @@ def _mapping(file: Path) -> dict[str, Any]:
 
 
 def _read(file: Path, name: str, value: object, count: int) -> list[float]:
-    numbers = value if isinstance(value, list | tuple) else [value]
+    numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value]
     good = len(numbers) == count and all(
         isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number) for number in numbers
     )

@@ -19,6 +19,8 @@ from flotilla.common import paths
 from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Fleet
 from lab.plants import wheeled
+from lab.wheeled import plant
+from lab.wheeled.plant import AXES, Trouble
 
 INVENTORY = Path(__file__).parent / "inventory"
 PERIOD_S = 0.01
@@ -26,12 +28,10 @@ SLOWER = 10
 """Steps of `drive` in one of `perceive`."""
 SCAN_AGE_S = 0.07
 """Of a scan when its last point is measured."""
-DRIVES = ("left", "right", "boom")
 _REMOVED = {
     "perceive": ("laser", "to_drive"),
-    "drive": ("clearance", "command", "in", "report", "to_station", *DRIVES),
+    "drive": ("clearance", "command", "in", "report", "to_station", *AXES),
 }
-_AT_ONCE_S = 1e-6
 
 Row = dict[str, Any]
 
@@ -50,16 +50,6 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Trouble:
-    """What is wrong from one time to another."""
-
-    begin_s: float
-    end_s: float
-    what: str
-    """`scanner`: no scans; or a drive, which is in fault."""
-
-
-@dataclass(frozen=True)
 class Course:
     """A drive."""
 
@@ -67,7 +57,7 @@ class Course:
     commands: Sequence[Command]
     room: str = "corner"
     troubles: Sequence[Trouble] = ()
-    plant: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
+    figures: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     """Parameters that are not those of wheeled_robot.yml."""
     changes: Mapping[str, object] = field(default_factory=dict)
     """Parameters of the tasks that are not those of their files, by `block.parameter`."""
@@ -96,7 +86,7 @@ def task(course: Course, described: Fleet) -> dict[str, Any]:
     blocks |= _script(course)
     drive = yaml.safe_load(tasks["drive"])["blocks"]
     for port, kind in (("target", "double"), ("enable", "boolean")):
-        ends = [_wire(wires["drive"], "drive", drive[name]["in"][port]) for name in DRIVES]
+        ends = [_wire(wires["drive"], "drive", drive[name]["in"][port]) for name in AXES]
         blocks[port] = {
             "type": "join",
             "in": {f"in{i}": end for i, end in enumerate(ends)},
@@ -106,7 +96,7 @@ def task(course: Course, described: Fleet) -> dict[str, Any]:
         "type": "wheeled-robot",
         "in": {"target": "target.out", "enable": "enable.out", "fault": "fault.out"},
         "parameters": {
-            "figures": wheeled.figures(**course.plant),
+            "figures": wheeled.figures(**course.figures),
             "walls": wheeled.walls(wheeled.ROOMS / f"{course.room}.yml"),
             "cluster": 4,
         },
@@ -121,7 +111,7 @@ def _wires() -> dict[str, dict[str, object]]:
         "clearance.sequence": "robot.scans", "command.flag": "heard.on", "in.v": "script.position[0]",
         "in.omega": "script.position[1]", "in.boom": "script.position[2]", "in.enable": "enabled.on",
     }  # fmt: skip
-    for index, name in enumerate(DRIVES):
+    for index, name in enumerate(AXES):
         drive |= {
             f"{name}.enabled": f"robot.enabled[{index}]", f"{name}.position": f"robot.position[{index}]",
             f"{name}.flag": 1,
@@ -133,45 +123,31 @@ def _wires() -> dict[str, dict[str, object]]:
 def _wire(wires: Mapping[str, object], task: str, wire: object) -> object:
     if not isinstance(wire, str):
         return wire
-    return wires[wire] if wire in wires else f"{task}_{wire}"
+    return wires.get(wire, f"{task}_{wire}")
 
 
 def _script(course: Course) -> dict[str, Any]:
-    rows = [
+    rows: list[tuple[float, Sequence[float]]] = [
         (each.at_s, [each.v, each.omega, each.boom, float(each.enable), float(each.heard)]) for each in course.commands
     ]
-    blocks = {"script": _steps(rows)}
+    blocks = {"script": plant.steps(rows)}
     for index, name in ((3, "enabled"), (4, "heard")):
         blocks[name] = _flag(f"script.position[{index}]")
-    for number, what in enumerate(("scanner", *DRIVES)):
-        at = [(0.0, [0.0])]
+    for number, what in enumerate(("scanner", *AXES)):
+        at: list[tuple[float, Sequence[float]]] = [(0.0, [0.0])]
         for trouble in course.troubles:
             if trouble.what == what:
                 at += [(trouble.begin_s, [1.0]), (trouble.end_s, [0.0])]
-        blocks[f"trouble{number}"] = _steps(at)
+        blocks[f"trouble{number}"] = plant.steps(at)
         blocks[f"is{number}"] = _flag(f"trouble{number}.position[0]")
     blocks["sound"] = {"type": "schmitt-trigger", "in": {"in": "well.out"}, "parameters": {"on": 0.5, "off": 0.5}}
     blocks["well"] = {"type": "sum", "in": {"in0": 1, "in1": "trouble0.position[0]"}, "parameters": {"signs": "+-"}}
     blocks["fault"] = {
         "type": "join",
-        "in": {f"in{i}": f"is{i + 1}.on" for i in range(len(DRIVES))},
-        "parameters": {"inputs": len(DRIVES), "type": "boolean"},
+        "in": {f"in{i}": f"is{i + 1}.on" for i in range(len(AXES))},
+        "parameters": {"inputs": len(AXES), "type": "boolean"},
     }
     return blocks
-
-
-def _steps(rows: Sequence[tuple[float, list[float]]]) -> dict[str, Any]:
-    """A signal that jumps to these values at these times."""
-    times, points = [0.0], list(rows[0][1])
-    for (_, before), (at_s, after) in zip(rows, rows[1:], strict=False):
-        times += [at_s, at_s + _AT_ONCE_S]
-        points += before + after
-    times.append(times[-1] + 1)
-    points += rows[-1][1]
-    return {
-        "type": "trajectory",
-        "parameters": {"waypoints": points, "times": times, "dimensions": len(rows[0][1])},
-    }
 
 
 def _flag(wire: str) -> dict[str, Any]:

@@ -19,7 +19,8 @@ import yaml
 from flotilla.common.errors import UserError
 from lab.plants import wheeled
 from lab.wheeled import by_wires
-from lab.wheeled.by_wires import Command, Course, Row, Trouble
+from lab.wheeled.by_wires import Command, Course, Row
+from lab.wheeled.plant import Trouble
 from tests.running import PATIENCE
 from tests.runtime import test_plant_blocks
 
@@ -137,9 +138,13 @@ def test_parameters_are_checked(tmp_path: Path) -> None:
         ({"initial_pose": [0, 0]}, "is not a list of 3 numbers"),
     ):
         with pytest.raises(UserError, match=reason.replace("[", "\\[")):
-            wheeled.figures(**changes)  # type: ignore[arg-type]
+            wheeled.figures(**changes)
     room = tmp_path / "room.yml"
-    for text, reason in (("walls: [[0, 1, 2]]", "is not a list of 4"), ("wall: []", "needs `walls`"), ("{", "not YAML")):
+    for text, reason in (
+        ("walls: [[0, 1, 2]]", "is not a list of 4"),
+        ("wall: []", "needs `walls`"),
+        ("{", "not YAML"),
+    ):
         room.write_text(text)
         with pytest.raises(UserError, match=reason):
             wheeled.walls(room)
@@ -163,15 +168,13 @@ def test_the_block_refuses(command: list[str | Path], tmp_path: Path, change: di
 
 def at_rest_after(rows: list[Row], at_s: float) -> float:
     """Seconds from then on until it rests for good."""
-    moving = [
-        index for index, row in enumerate(rows) if abs(row["motion"][0]) > 0.01 or abs(row["motion"][1]) > 0.02
-    ]
+    moving = [index for index, row in enumerate(rows) if abs(row["motion"][0]) > 0.01 or abs(row["motion"][1]) > 0.02]
     return max(0.0, (moving[-1] + 1) * by_wires.PERIOD_S - at_s)
 
 
 AROUND_M, AHEAD_M = 0.05, 0.11
-"""What stays free: on all sides by the disc of perceive.yml, and before a wall that it runs at straight by the margin of
-drive.yml, too."""
+"""What stays free: on all sides by the disc of perceive.yml, and before a wall that it runs at straight by the margin
+of drive.yml, too."""
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.35, -0.6])
@@ -180,7 +183,7 @@ def test_it_stops_before_a_wall(drive: Drive, heading: float, change: dict[str, 
     """From 0.5 m/s, whatever is commanded, on a slippery floor and with a load, too. Seen to fail with `slowest` by
     twice the deceleration, with clearances of a robot without radius, and without what is travelled since the scan."""
     rows = drive(
-        Course(14, [*BY_HAND, Command(1, 0.5)], plant={"initial_pose": [0, 0, heading], **change}),
+        Course(14, [*BY_HAND, Command(1, 0.5)], figures={"initial_pose": [0, 0, heading], **change}),
     )
     assert max(row["motion"][0] for row in rows) > 0.49
     last = rows[-1]
@@ -205,7 +208,7 @@ def test_nobody_drives_it_into_anything(drive: Drive, seed: int) -> None:
     commands = [
         Command(1 + 0.7 * index, wild.uniform(0, 0.9), wild.choice([0, 0, wild.uniform(-3, 3)])) for index in range(170)
     ]
-    rows = drive(Course(120, [*BY_HAND, *commands], plant={"seed": seed}))
+    rows = drive(Course(120, [*BY_HAND, *commands], figures={"seed": seed}))
     gone = sum(abs(row["motion"][0]) for row in rows) * by_wires.PERIOD_S
     print(f"{gone:.1f} m, {1e3 * rows[-1]['least']:.0f} mm at the least")
     assert rows[-1]["contacts"] == 0

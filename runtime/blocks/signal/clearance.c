@@ -7,9 +7,9 @@
  *   point i: p = (x + range·cos(b), range·sin(b)),  b = first + i·increment;  x ahead, y to the left
  *   curve of curvature 0: s = px − √(radius² − py²)
  *   other curves: R = 1/|curvature|, q = py for a curve to the left, −py for one to the right,
- *     d = |(px, q − R)|, s = R·(atan2(px, R − q) − acos((R² + d² − radius²)/(2·R·d))), plus a turn where that is negative
- *   clearance = least s ≥ 0 of all points that the disc touches, at most `reach`
- *   a point that is within the disc already: clearance 0 where px > 0, otherwise the robot leaves it behind
+ *     d = |(px, q − R)|, s = R·(atan2(px, R − q) − acos((R² + d² − radius²)/(2·R·d))), plus a turn where that is
+ * negative clearance = least s ≥ 0 of all points that the disc touches, at most `reach` a point that is within the disc
+ * already: clearance 0 where px > 0, otherwise the robot leaves it behind
  *
  * Failure: A direction whose range is not finite counts as free, as beyond the scanner's reach. While fewer than
  * `least_seen` of all directions have a finite range, or the input `flag` is 0, the output `flag` is 0, and each
@@ -66,10 +66,9 @@ static int configure(struct fl_block *block)
                                                     .width = (uint32_t)set->curvatures.count,
                                                     .unit = "m",
                                                     .summary = "path of the axle's middle, on each curve"});
-    failed |= fl_add_output(block, (struct fl_port){.name = "flag",
-                                                    .type = FL_BOOLEAN,
-                                                    .width = 1,
-                                                    .summary = "1: the clearances are good"});
+    failed |= fl_add_output(
+        block,
+        (struct fl_port){.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: the clearances are good"});
     return failed;
 }
 

@@ -4,12 +4,11 @@
  * stays: rate of turn and speed are slowed alike. Turning on the spot is not slowed, because the robot is round.
  *
  * Equations:
- *   k from omega/v as measured to omega/v as commanded: curves that the robot may be on; speeds below 0.01 m/s have none
- *   c = least of the clearances of these curves, with the next one in `curvatures` on either side
- *   travelled = speed·age when clearances arrive, and the integral of the measured speed ahead since then
- *   f = max(c − margin − travelled, 0)
- *   slowest = √((deceleration·delay)² + 2·deceleration·f) − deceleration·delay: the speed from which f is needed to stop
- *   out v = min(v, slowest) ahead, max(v, −backward) back;  out omega = omega·(out v)/v, omega where v = 0
+ *   k from omega/v as measured to omega/v as commanded: curves that the robot may be on; speeds below 0.01 m/s have
+ * none c = least of the clearances of these curves, with the next one in `curvatures` on either side travelled =
+ * speed·age when clearances arrive, and the integral of the measured speed ahead since then f = max(c − margin −
+ * travelled, 0) slowest = √((deceleration·delay)² + 2·deceleration·f) − deceleration·delay: the speed from which f is
+ * needed to stop out v = min(v, slowest) ahead, max(v, −backward) back;  out omega = omega·(out v)/v, omega where v = 0
  *
  * Failure: While the flag is 0, `age` is beyond `timeout`, or an input is not finite, v and omega are 0, and `limited`
  * is 1.
@@ -119,8 +118,8 @@ static int step(struct fl_block *block)
 {
     const struct stop *set = block->parameters;
     double v = FL_IN(block, V, double), omega = FL_IN(block, OMEGA, double);
-    bool finite = isfinite(v) && isfinite(omega) && isfinite(FL_IN(block, SPEED, double)) &&
-                  isfinite(FL_IN(block, RATE, double));
+    bool finite =
+        isfinite(v) && isfinite(omega) && isfinite(FL_IN(block, SPEED, double)) && isfinite(FL_IN(block, RATE, double));
     double path = finite ? clearance_of(block) - set->margin - travelled(block) : 0;
     double lag = set->deceleration * set->delay, free = fmax(path, 0), slowest, ahead;
     bool good = FL_IN(block, FLAG, uint8_t) && FL_IN(block, AGE, double) <= set->timeout && finite && isfinite(path);
@@ -137,7 +136,8 @@ FL_BLOCK(obstacle_stop) = {
     .abi = FL_ABI,
     .name = "obstacle-stop",
     .summary = "slows a commanded motion so that the robot can stop before what it sees",
-    .source = "Fox, Burgard, Thrun, The Dynamic Window Approach to Collision Avoidance, section 4.1: admissible velocities",
+    .source =
+        "Fox, Burgard, Thrun, The Dynamic Window Approach to Collision Avoidance, section 4.1: admissible velocities",
     FL_TABLE(input, inputs),
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),

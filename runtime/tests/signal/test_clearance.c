@@ -95,7 +95,8 @@ static void refuses(void **state)
 {
     (void)state;
     assert_non_null(strstr(testbed_refusal("curve-clearance", "points", "1", "first", "0", "increment", "0", "radius",
-                                        "1", "curvatures", "0,1,1", NULL), "curvatures: 1 does not increase to 1"));
+                                           "1", "curvatures", "0,1,1", NULL),
+                           "curvatures: 1 does not increase to 1"));
 }
 
 int main(void)

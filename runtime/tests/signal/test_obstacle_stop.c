@@ -68,7 +68,7 @@ static void looks_along_the_curve(void **state)
     (void)state;
     struct fl_block *block = stop("0");
     see(block, 9, 9, 0.34);
-    assert_near(drive(block, 1, 0), 1, 0); /* straight on, where there is a curve for it */
+    assert_near(drive(block, 1, 0), 1, 0);         /* straight on, where there is a curve for it */
     assert_near(drive(block, 1, 0.5), 0.4, 1e-12); /* between two */
     assert_near(GET(block, "omega", double), 0.2, 1e-12);
     assert_near(drive(block, 1, 3), 0.4, 1e-12); /* beyond the last */
@@ -127,18 +127,17 @@ static void stops_without_eyes(void **state)
 static void refuses(void **state)
 {
     (void)state;
-    assert_non_null(strstr(testbed_refusal("obstacle-stop", "deceleration", "1", "delay", "0", "margin", "0", "curvatures", "1,0", NULL), "curvatures: 1 does not increase to 0"));
+    assert_non_null(strstr(
+        testbed_refusal("obstacle-stop", "deceleration", "1", "delay", "0", "margin", "0", "curvatures", "1,0", NULL),
+        "curvatures: 1 does not increase to 0"));
 }
 
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(slows_before_what_it_sees),
-        cmocka_unit_test(counts_what_it_has_gone_since_the_scan),
-        cmocka_unit_test(looks_along_the_curve),
-        cmocka_unit_test(goes_back_blindly),
-        cmocka_unit_test(stops_without_eyes),
-        cmocka_unit_test(refuses),
+        cmocka_unit_test(slows_before_what_it_sees), cmocka_unit_test(counts_what_it_has_gone_since_the_scan),
+        cmocka_unit_test(looks_along_the_curve),     cmocka_unit_test(goes_back_blindly),
+        cmocka_unit_test(stops_without_eyes),        cmocka_unit_test(refuses),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
