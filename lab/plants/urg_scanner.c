@@ -147,7 +147,8 @@ static void send_scan(struct fl_block *block, struct state *state)
             if (range >= 20 && (!shortest || range < shortest))
                 shortest = range;
         }
-        used += encode(text + used, shortest, characters);
+        uint32_t most = (1u << 6 * characters) - 1;
+        used += encode(text + used, shortest < most ? shortest : most, characters);
     }
     answer(state, command, "99");
     encode(time, (uint32_t)(block->release_ns / 1000000) & 0xFFFFFF, sizeof time);

@@ -1,7 +1,7 @@
 """Courses in virtual time: one guest that boots the shipped system, with the robot's tasks, drivers and CAN.
 
-The tasks are those that images bring, rendered for the fleet of `inventory/`. Two CAN boards are on one bus: the robot's
-own, and the drives'. The scanner is a pseudo terminal, as its USB has no bit rate. A run repeats to the byte.
+The tasks are those that images bring, rendered for the fleet of `inventory/`. Two CAN boards are on one bus: the
+robot's own, and the drives'. The scanner is a pseudo terminal, as its USB has no bit rate. A run repeats to the byte.
 """
 
 from __future__ import annotations
