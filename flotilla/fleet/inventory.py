@@ -77,7 +77,8 @@ def summary(fleet: Fleet) -> str:
             robot.name,
             robot.board,
             str(robot.address),
-            ", ".join(f"{name} on {device.port}" for name, device in robot.devices.items()) or "no devices",
+            ", ".join(f"{name} on {device.port or device.usb}" for name, device in robot.devices.items())
+            or "no devices",
         )
         for number, robot in fleet.robots.items()
     ]
@@ -457,6 +458,23 @@ def _devices(raw: dict[str, Any]) -> Iterator[Finding]:
                 yield loc, f"the board {robot['board']} has no such port", _free(ports, used.values(), console)
             elif console and ports[port].get("tty") == console:
                 yield loc, f"is the console's port ({console})", _free(ports, used.values(), console)
+        yield from _plugged(name, robot.get("devices", {}))
+
+
+def _plugged(robot: str, devices: dict[str, Any]) -> Iterator[Finding]:
+    """Each device is at a port or on USB, and USB tells each from the others."""
+    identities: dict[Loc, str] = {}
+    for device, plug in devices.items():
+        loc: Loc = ("robots", robot, "devices", device)
+        if bool(plug.get("port")) == bool(plug.get("usb")):
+            wrong = "is both at a port and on USB" if plug.get("port") else "is plugged into nothing: port is missing"
+            yield loc, wrong, "either port, such as COM5, or usb, such as '15d1:0000'"
+        elif plug.get("usb"):
+            identities[(*loc, "usb")] = plug["usb"]
+    for loc, identity in identities.items():
+        for other, another in identities.items():
+            if loc != other and identity.startswith(another) and (len(identity) > len(another) or other < loc):
+                yield loc, f"is also {other[3]}'s", "the serial number of each behind it, such as '0403:6001/A9XYZ'"
 
 
 def _named(raw: dict[str, Any], robot: str, key: str) -> dict[Loc, str]:

@@ -87,6 +87,14 @@ Interface = Annotated[
         r"[a-z][a-z0-9]{0,14}", "is not a network interface's name", "such as eth0 or wlan0, at most 15 characters"
     ),
 ]
+UsbIdentity = Annotated[
+    str,
+    matching(
+        r"|[0-9a-f]{4}:[0-9a-f]{4}(/[A-Za-z0-9_.-]{1,64})?",
+        "is not who a USB device is",
+        "vendor and product in quotes, small hexadecimal digits, such as '15d1:0000', and /SERIAL if it has one",
+    ),
+]
 CanInterface = Annotated[
     str,
     matching(r"can[0-9]", "is not a CAN interface's name", "can0 to can9, as the kernel names the board's channels"),
@@ -380,10 +388,13 @@ class Releases(_Model):
 
 
 class Device(_Model):
-    """Something plugged into a serial port. Its name becomes `/dev/robot/NAME`."""
+    """Something plugged into a serial port, or into USB as one. Its name becomes `/dev/robot/NAME`."""
 
-    port: str
-    """The connector's name in the board's `ports`."""
+    port: str = ""
+    """The connector's name in the board's `ports`. Give this, or `usb`."""
+    usb: UsbIdentity = ""
+    """Who it is on USB, in whichever socket: vendor and product as `lsusb` shows them, `15d1:0000` for a Hokuyo URG.
+    Where a robot has several of a kind, also the serial number, `0403:6001/A9XYZ`."""
     baud: Baud
     """Bit rate, as the device's manual says."""
 

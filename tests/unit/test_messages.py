@@ -73,7 +73,7 @@ CASES = {
         "    gyro: {", "    igps: { type: boolean }\n    gyro: {", "sensors.signals.igps", "stands twice", "igps",
     ),
     "no such sender": Case(
-        "sender: navigation", "sender: stars", "state.sender", "no file…stars.yml…one of control, heading", "stars",
+        "sender: navigation", "sender: stars", "state.sender", "no file…stars.yml…one of control…heading", "stars",
     ),
     "stations send": Case("sender: navigation", "sender: stations", "state.sender", "no file…one of", "stations"),
     "no such receiver": Case(
@@ -111,7 +111,7 @@ CASES = {
     ),
     "no signals": Case(
         "    flying: { type: boolean }\n    done: { type: boolean }\n",
-        "heartbeat-idle: { sender: heartbeat, receiver: stations, port: 5022, rate_hz: 1, every: 100, signals: {} }\n",
+        "heartbeat-idle: { sender: heartbeat, receiver: stations, port: 5040, rate_hz: 1, every: 100, signals: {} }\n",
         "heartbeat-idle.signals", "there are none…at least one", "heartbeat-idle",
     ),
     "too long": Case(
