@@ -208,11 +208,12 @@ static void move(struct wheeled *robot, const struct wheeled_demand *demand, dou
     double left = roll_wheel(robot, WHEELED_LEFT, &demand[WHEELED_LEFT], h);
     double right = roll_wheel(robot, WHEELED_RIGHT, &demand[WHEELED_RIGHT], h);
     double rolling = set->rolling * tanh(robot->speed / creep);
-    double speed = robot->speed, rate = robot->rate, *pose = robot->pose;
+    double speed = robot->speed, rate = robot->rate, *pose = robot->pose, arm = set->track / 2;
+    double scrub = set->rolling * arm * tanh(rate * arm / creep);
     robot->speed += h * (left + right - rolling) / set->mass;
-    robot->rate += h * (right - left) * set->track / 2 / set->inertia;
+    robot->rate += h * ((right - left) * arm - scrub) / set->inertia;
     double middle = pose[2] + h * (rate + robot->rate) / 4, moved = h * (speed + robot->speed) / 2;
-    robot->lost += rolling * moved;
+    robot->lost += rolling * moved + scrub * h * (rate + robot->rate) / 2;
     pose[0] += moved * cos(middle);
     pose[1] += moved * sin(middle);
     pose[2] += h * (rate + robot->rate) / 2;

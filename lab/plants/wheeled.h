@@ -2,7 +2,8 @@
  * scanner in a room of straight walls.
  *
  *   wheel   J_w · ω̇ = τ − r · F − d · ω,  F = μ · N · tanh((r·ω − g)/s),  g: speed of the axle over the floor there
- *   body    m · v̇ = F_l + F_r − c · tanh(v / 0.01 m/s),  J · Ω̇ = (F_r − F_l) · b/2;  the axle does not slip sideways
+ *   body    m · v̇ = F_l + F_r − c · tanh(v / 0.01 m/s),  J · Ω̇ = (F_r − F_l − c · tanh(Ω · b/2 / 0.01 m/s)) · b/2
+ *           the axle does not slip sideways
  *   boom    J_b · φ̈ = τ_b − load − d_b · φ̇, between its end stops
  *   motor   a PI loop of speed with a limited torque, as a drive's inner loops; its time constant is `lag`
  *

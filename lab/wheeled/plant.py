@@ -55,7 +55,10 @@ AXES = ("left", "right", "boom")
 
 
 def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[str, Any]:
-    """Drives on a CAN interface, the scanner at the link `laser`. Of less priority than the robot's tasks: a device."""
+    """Drives on a CAN interface, the scanner at the link `laser`.
+
+    Of less priority than the robot's tasks and between their releases: devices have processors of their own.
+    """
     blocks: dict[str, Any] = {
         "drives": {
             "type": "epos2-drives",
@@ -101,7 +104,7 @@ def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[s
     }
     for name in AXES:
         blocks[name] = _pulses([(trouble, trouble.code) for trouble in plant.troubles if trouble.what == name])
-    return {"period": f"{PERIOD_MS} ms", "priority": priority, "overruns": 0, "blocks": blocks}
+    return {"period": f"{PERIOD_MS} ms", "phase": "1 ms", "priority": priority, "overruns": 0, "blocks": blocks}
 
 
 def steps(rows: Sequence[tuple[float, Sequence[float]]]) -> dict[str, Any]:

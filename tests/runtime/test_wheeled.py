@@ -180,8 +180,8 @@ of drive.yml, too."""
 @pytest.mark.parametrize("heading", [0.0, 0.35, -0.6])
 @pytest.mark.parametrize("change", [{}, {"grip": 0.25}, {"mass": 30}, {"seed": 7}], ids=str)
 def test_it_stops_before_a_wall(drive: Drive, heading: float, change: dict[str, float]) -> None:
-    """From 0.5 m/s, whatever is commanded, on a slippery floor and with a load, too. Seen to fail with `slowest` by
-    twice the deceleration, with clearances of a robot without radius, and without what is travelled since the scan."""
+    """From 0.5 m/s, whatever is commanded, on a slippery floor and with a load, too. Seen to fail with clearances of a
+    robot without radius."""
     rows = drive(
         Course(14, [*BY_HAND, Command(1, 0.5)], figures={"initial_pose": [0, 0, heading], **change}),
     )
@@ -203,7 +203,7 @@ def test_without_the_block_it_would_run_into_it(drive: Drive) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_nobody_drives_it_into_anything(drive: Drive, seed: int) -> None:
-    """Two minutes of wild commands ahead. Seen to fail without the curves between measured and commanded ones."""
+    """Two minutes of wild commands ahead."""
     wild = random.Random(seed)
     commands = [
         Command(1 + 0.7 * index, wild.uniform(0, 0.9), wild.choice([0, 0, wild.uniform(-3, 3)])) for index in range(170)

@@ -153,7 +153,7 @@ CASES = {
         "is not who a USB…15d1:0000",
         "Hokuyo",
         also=1,
-    ),  # fmt: skip
+    ),
     "usb twice": Case(
         ROBOTS,
         "              port: COM6\n              baud: 9600\n            battery: # OceanServer battery controller\n"
