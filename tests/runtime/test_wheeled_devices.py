@@ -81,7 +81,7 @@ def wait_alive(task: Task) -> None:
 
 
 def test_a_master_moves_a_motor(run: Any, network: canopen.Network, on_the_bus: None) -> None:
-    """NMT, PDOs at SYNC, the state machine. Seen to fail with TPDOs that carry the values of the SYNC before."""
+    """NMT, PDOs at SYNC, the state machine. Seen to fail with values that are not refreshed at SYNC."""
     with run(Plant()) as task:
         wait_alive(task)
         drive = node(network, LEFT)
