@@ -81,11 +81,6 @@ bool wheeled_check(const struct wheeled_parameters *parameters, const double *wa
     return true;
 }
 
-size_t wheeled_size(void)
-{
-    return sizeof(struct wheeled);
-}
-
 void wheeled_begin(struct wheeled *robot, const struct wheeled_parameters *parameters, const double *walls,
                    size_t count)
 {
@@ -156,11 +151,8 @@ static double roll_wheel(struct wheeled *robot, int side, const struct wheeled_d
     wheel->torque = drive(wheel, demand, inertia, set->wheel_torque, set, h);
     double before = wheel->speed;
     wheel->speed += h * (wheel->torque - r * force - set->wheel_damping * before) / set->wheel_inertia;
-    double mean = (before + wheel->speed) / 2;
-    wheel->angle += h * mean;
+    wheel->angle += h * (before + wheel->speed) / 2;
     robot->slip[side] = slip;
-    robot->work += h * wheel->torque * mean;
-    robot->lost += h * (set->wheel_damping * before * mean + force * (r * mean - robot->speed - arm * robot->rate));
     return force;
 }
 
@@ -195,7 +187,6 @@ static void touch(struct wheeled *robot, const double before[2])
     if (into) {
         robot->contacts += !robot->touching;
         robot->impact = fmax(robot->impact, fabs(robot->speed));
-        robot->lost += robot->parameters.mass * robot->speed * robot->speed / 2;
         robot->speed = 0;
     }
     robot->touching = nearest < 0;
@@ -213,7 +204,6 @@ static void move(struct wheeled *robot, const struct wheeled_demand *demand, dou
     robot->speed += h * (left + right - rolling) / set->mass;
     robot->rate += h * ((right - left) * arm - scrub) / set->inertia;
     double middle = pose[2] + h * (rate + robot->rate) / 4, moved = h * (speed + robot->speed) / 2;
-    robot->lost += rolling * moved + scrub * h * (rate + robot->rate) / 2;
     pose[0] += moved * cos(middle);
     pose[1] += moved * sin(middle);
     pose[2] += h * (rate + robot->rate) / 2;

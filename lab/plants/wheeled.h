@@ -12,8 +12,8 @@
  * URG-04LX specifications, for directions, range and accuracy. wheeled_robot.yml says which figures are published.
  *
  * Axes are the room's, the heading turns from x to y and is not wrapped. SI units; time is counted in whole
- * nanoseconds. No I/O, no globals, no allocation. The random numbers are plant.h's. Used by a block (wheeled_robot.c)
- * and by Python (wheeled.py).
+ * nanoseconds. No I/O, no globals, no allocation. The random numbers are plant.h's. Used by a block (wheeled_robot.c);
+ * wheeled.py reads the names of the parameters from here.
  */
 #ifndef WHEELED_H
 #define WHEELED_H
@@ -96,8 +96,7 @@ struct wheeled {
     double impact;     /* m/s, the fastest of these */
     double least;      /* m, between body and nearest wall, the least so far */
     bool touching;
-    double work, lost; /* J: by the wheels' drives; in slip, damping, rolling and impacts */
-    uint64_t stream;   /* of random numbers */
+    uint64_t stream; /* of random numbers */
 };
 
 /* False with the reason when parameters or walls, `count` of them, cannot be. */
@@ -122,8 +121,5 @@ double wheeled_cast(const struct wheeled *robot, double bearing);
 
 /* A scan in mm as a URG-04LX tells it, with noise: 0 where nothing is measured. */
 void wheeled_scan(struct wheeled *robot, uint16_t millimetres[WHEELED_STEPS]);
-
-/* Size of the structure, for Python. */
-size_t wheeled_size(void);
 
 #endif
