@@ -4,12 +4,11 @@
  * robot is a disc around the middle of its axle. Only motion ahead is considered.
  *
  * Equations:
- *   point i: p = (x + range·cos(b), range·sin(b)),  b = first + i·increment;  x ahead, y to the left
- *   curve of curvature 0: s = px − √(radius² − py²)
- *   other curves: R = 1/|curvature|, q = py for a curve to the left, −py for one to the right,
- *     d = |(px, q − R)|, s = R·(atan2(px, R − q) − acos((R² + d² − radius²)/(2·R·d))), plus a turn where that is
- * negative clearance = least s ≥ 0 of all points that the disc touches, at most `reach` a point that is within the disc
- * already: clearance 0 where px > 0, otherwise the robot leaves it behind
+ *   b = first + i·increment,  px = x + range·cos(b),  py = range·sin(b);  point i of the scan, x ahead, y to the left
+ *   straight on s = px − √(radius² − py²), where |py| < radius and px > 0
+ *   R = 1/|curvature|;  q = py on a curve to the left, −py on one to the right;  d = √(px² + (q − R)²)
+ *   on a curve s = R·(atan2(px, R − q) − acos((R² + d² − radius²)/(2·R·d))), plus 2π·R where that is negative
+ *   clearance = min(s of all points, reach);  a point within the disc: s = 0 where px > 0, otherwise it is left behind
  *
  * Failure: A direction whose range is not finite counts as free, as beyond the scanner's reach. While fewer than
  * `least_seen` of all directions have a finite range, or the input `flag` is 0, the output `flag` is 0, and each

@@ -4,11 +4,12 @@
  * stays: rate of turn and speed are slowed alike. Turning on the spot is not slowed, because the robot is round.
  *
  * Equations:
- *   k from omega/v as measured to omega/v as commanded: curves that the robot may be on; speeds below 0.01 m/s have
- * none c = least of the clearances of these curves, with the next one in `curvatures` on either side travelled =
- * speed·age when clearances arrive, and the integral of the measured speed ahead since then f = max(c − margin −
- * travelled, 0) slowest = √((deceleration·delay)² + 2·deceleration·f) − deceleration·delay: the speed from which f is
- * needed to stop out v = min(v, slowest) ahead, max(v, −backward) back;  out omega = omega·(out v)/v, omega where v = 0
+ *   k = omega/v of the measured motion to omega/v of the commanded one;  a speed below 0.01 m/s has none of its own
+ *   c = min(clearance of the curves in k, and of the next one in `curvatures` on either side)
+ *   travelled = speed·age when clearances arrive, then the integral of the measured speed ahead
+ *   free = max(c − margin − travelled, 0);  a = deceleration
+ *   allowed = √((a·delay)² + 2·a·free) − a·delay;  from this speed `free` is needed to stop
+ *   v = max(min(v, allowed), −backward);  omega = omega·(v allowed)/(v commanded), or omega where that is 0
  *
  * Failure: While the flag is 0, `age` is beyond `timeout`, or an input is not finite, v and omega are 0, and `limited`
  * is 1.
