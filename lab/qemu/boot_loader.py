@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from flotilla.fleet.model import Board
 from images.builder import card, environment_block, slot
@@ -183,6 +184,10 @@ class BootLoader:
         with self._disk.open("rb") as disk:
             disk.seek(offset)
             return disk.read(length)
+
+    def execute(self, command: str, **arguments: object) -> Any:
+        """A QMP command."""
+        return self._emulator.execute(command, **arguments)
 
     def wait_event(self, name: str, timeout: float) -> dict[str, object]:
         """A QMP event, such as WATCHDOG."""
