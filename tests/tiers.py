@@ -21,6 +21,8 @@ LONGEST = (
     "test_boot_loader.py",
     "test_power_cuts_guest.py",
     "test_power_cuts.py",
+    "test_update.py",
+    "test_bad_releases.py",
     "test_deploy.py",
     "test_accidents.py",
     "test_scenarios.py",
