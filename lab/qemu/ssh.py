@@ -30,9 +30,13 @@ HOPELESS = ("Permission denied", "Host key verification failed", "REMOTE HOST ID
 class Ssh:
     """Commands on a robot. Connects when first used, and again after the robot was away."""
 
-    def __init__(self, robot: Robot, host: str, port: Callable[[], int] = lambda: 22) -> None:
-        """`port` is asked at each connection, because a guest's changes when it is powered on again."""
+    def __init__(
+        self, robot: Robot, host: str, port: Callable[[], int] = lambda: 22, within: Sequence[str] = ()
+    ) -> None:
+        """`port` is asked at each connection, because a guest's changes when it is powered on again. `within`: what
+        goes before a command that is to run on the station's computer, where that is not this one."""
         self._robot = robot
+        self._within = within
         self._scratch = tempfile.TemporaryDirectory(prefix="lab-")  # sockets' paths must be short
         self._options = ["-F", "none", *ssh_options(robot), "-o", f"ControlPath={self._scratch.name}/master"]
         self._host = host
@@ -151,7 +155,7 @@ class Ssh:
             raise Expired(f"{self._robot.name}: {shlex.join(argv)}: no end within {timeout:g} s\n{so_far}") from None
 
     def _command(self, argv: Sequence[str]) -> list[str]:
-        return ["ssh", *self._options, self._host, shlex.join(argv)]
+        return [*self._within, "ssh", *self._options, self._host, shlex.join(argv)]
 
     def _try_to_connect(self, deadline: Deadline) -> str | None:
         """Start the shared connection: None when it stands, else what ssh said."""
@@ -159,7 +163,7 @@ class Ssh:
         # `LocalCommand` runs once the connection stands, so its output is the event to wait for.
         ready = ["-o", "PermitLocalCommand=yes", "-o", "LocalCommand=echo ready"]
         alive = ["-o", "ConnectTimeout=20", "-o", "ServerAliveInterval=10", "-o", "ServerAliveCountMax=6"]
-        argv = [*DIE_WITH_PARENT, "ssh", "-M", "-N", *ready, *alive, *self._options]
+        argv = [*self._within, *DIE_WITH_PARENT, "ssh", "-M", "-N", *ready, *alive, *self._options]
         argv += ["-p", str(self._port()), self._host]
         self._master = subprocess.Popen(
             argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
