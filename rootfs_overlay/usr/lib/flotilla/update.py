@@ -7,7 +7,8 @@
   copy      take what the running release has in the same place
   write     standard input: chunks, each behind its number and length (two unsigned 32-bit numbers, little-endian)
   delta     standard input: a delta from the running release's content, as flotilla-patch reads it
-  finish    read all back from the card, and write the header: from now on the slot holds the release
+  finish    read all back from the card, and write the header: from now on the slot holds the release; remove the spool
+            of /usr/lib/flotilla/receive
   activate  try it at the next start; the layer above /etc begins as a copy of the running release's
 
 Each prints one object of JSON: `release`, `slot`, `base` (SHA-256 of the running release's content), `running` (the
@@ -308,6 +309,8 @@ def finish() -> dict[str, Any]:
         release.slot.flush()
         release.slot.write(release.slot.size - HEADER_ROOM, block)
         release.slot.flush()
+    if not missing:  # nothing of it is needed any more
+        subprocess.run(["rm", "-rf", f"{KNOWN}/spool"], check=True)
     return release.said(missing)
 
 
