@@ -228,8 +228,8 @@ def rauc(stage: Stage, memory: Memory) -> str:
     for process in (service, bus):
         process.terminate()
         process.wait()
-    said = alone.stderr.strip().splitlines()[0]
-    return f"bus and service before it begins: {idle}; without a bus: status {alone.returncode}, {said}"
+    message = alone.stderr.strip().splitlines()[0]
+    return f"bus and service before it begins: {idle}; without a bus: status {alone.returncode}, {message}"
 
 
 def swupdate(stage: Stage, memory: Memory) -> str:
@@ -296,11 +296,11 @@ def measure(architecture: str, mib: int) -> str:
             )
         if done.returncode:
             raise UserError(f"{engine}: the measurement failed (status {done.returncode})")
-        said = json.loads(done.stdout.splitlines()[-1])
-        each = ", ".join(f"{program} {kib}" for program, kib in sorted(said["programs"].items()))
+        measured = json.loads(done.stdout.splitlines()[-1])
+        each = ", ".join(f"{program} {kib}" for program, kib in sorted(measured["programs"].items()))
         lines.append(
-            f"  {engine}: {said['peak']} at one moment, {said['anonymous']} of it anonymous; largest process of each "
-            f"program: {each}; {said['remark']}"
+            f"  {engine}: {measured['peak']} at one moment, {measured['anonymous']} of it anonymous; "
+            f"largest process of each program: {each}; {measured['remark']}"
         )
     shutil.rmtree(tree)
     return "\n".join(lines)

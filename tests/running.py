@@ -71,11 +71,13 @@ class Task:
         deadline = time.monotonic() + PATIENCE
         line = "none"
         for line in self.process.stdout:
+            if not line.endswith("\n"):  # the output ended within the row
+                break
             assert time.monotonic() < deadline, f"not within {PATIENCE} s; the last row was {line}"
             row = json.loads(line)
             blocks = {name.rpartition(".")[0] for name in row if "." in name}
             yield {name.rpartition(".")[2] if len(blocks) == 1 else name: value for name, value in row.items()}
-        raise AssertionError(f"the task ended, status {self.process.wait()}; the last row was {line}")
+        raise AssertionError(f"the task ended, status {self.wait()}; the last row was {line}")
 
     def until(self, wanted: Callable[[Row], object]) -> Row:
         """The first row that is as wanted."""

@@ -18,9 +18,12 @@ TIERS = {"unit": "unit", "runtime": "runtime", "image": "image"} | dict.fromkeys
 LONGEST = (
     "test_fleet.py",
     "shared",
+    "test_update_airtime.py",
     "test_boot_loader.py",
     "test_power_cuts_guest.py",
     "test_power_cuts.py",
+    "test_update.py",
+    "test_bad_releases.py",
     "test_deploy.py",
     "test_accidents.py",
     "test_scenarios.py",
@@ -29,6 +32,7 @@ LONGEST = (
     "test_build.py",
     "test_control_loop.py",
     "test_blocks_guest.py",
+    "test_wheeled_virtual.py",
     "test_virtual_loop.py",
     "test_boot_time.py",
 )

@@ -60,8 +60,8 @@ def run_first(command: dict[str, Any]) -> None:
     stdin = base64.b64decode(command["stdin"])
     done = subprocess.run(command["argv"], input=stdin, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False)
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip()
-        raise RefusedError(f"{command['name']}: {said or f'status {done.returncode}'}")
+        message = done.stderr.decode(errors="replace").strip()
+        raise RefusedError(f"{command['name']}: {message or f'status {done.returncode}'}")
 
 
 def main() -> None:

@@ -286,8 +286,8 @@ def status(task: str) -> dict[str, Any]:
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     if done.returncode:
         return {"problem": done.stderr.strip() or f"flotilla-param ended with status {done.returncode}"}
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
 
 
 class Watch:
@@ -309,7 +309,7 @@ class Watch:
             if not waiting or time.monotonic() > self._begun + PATIENCE_S:
                 break
             time.sleep(0.5)
-        return {task: lately(self._before[task], told) for task, told in now.items()}
+        return {task: lately(self._before[task], found) for task, found in now.items()}
 
 
 def lately(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
@@ -358,9 +358,9 @@ def main() -> None:
         "data_free_bytes": data.f_bavail * data.f_frsize,
         "boot_id": read("/proc/sys/kernel/random/boot_id").strip(),
     }
-    told = watch.end(arguments["required_sensors"])
+    statuses = watch.end(arguments["required_sensors"])
     for name, task in tasks.items():
-        state["tasks"][name]["status"] = told.get(task)
+        state["tasks"][name]["status"] = statuses.get(task)
     print(json.dumps({"changed": False, "state": state}))
 
 

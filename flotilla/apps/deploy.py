@@ -57,11 +57,11 @@ def deploy(
     try:
         place(to, subject, board, on_robot=on_robot)
         if not keep:
-            said = remote.run(to, subject.name, show)
+            report = remote.run(to, subject.name, show)
         else:
             remote.keep(to, subject.name)
-            said = _start(to, subject.name)
-        return "\n".join(filter(None, (said, _hint(to.robot, subject.name, keep=keep))))
+            report = _start(to, subject.name)
+        return "\n".join(filter(None, (report, _hint(to.robot, subject.name, keep=keep))))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(remote.interrupted(to, subject.name)) from None
 

@@ -363,7 +363,7 @@ class _Reader:
 
     def _steps(self, times_s: list[float]) -> list[tuple[str, int, int]]:
         """The step functions, each with its rate's number, and how often it runs."""
-        said = {
+        sample_times = {
             int(number): float(time)
             for number, time in re.findall(
                 rf"\b{self.model}_step(\d+)\s*\([^)]*\)\s*/\*\s*Sample time: \[([0-9.eE+-]+)s,", self.code.sources
@@ -377,7 +377,7 @@ class _Reader:
         if numbered:
             names, numbers = [f"{self.model}_step{number}" for number in numbered], numbered
         elif single and "tid" in self._parameter_names(f"{self.model}_{single}"):
-            numbers = sorted(said) or list(range(len(times_s)))
+            numbers = sorted(sample_times) or list(range(len(times_s)))
             names = [f"{self.model}_step"] * len(numbers)
         elif single:
             names, numbers = [f"{self.model}_{single}"], [0]
@@ -387,7 +387,7 @@ class _Reader:
         else:
             has = ", ".join(sorted(name for name in self.functions)) or "none at all"
             raise self._no(f"has no function {self.model}_step (it has: {has}); models of exported functions have none")
-        times = times_s or [said[number] for number in numbers if number in said]
+        times = times_s or [sample_times[number] for number in numbers if number in sample_times]
         if base and times and times[0] == 0 and not times_s:  # continuous: runs with the solver's step
             times[0] = float(base[1])
         if not times and len(numbers) == 1 and base:
@@ -502,7 +502,7 @@ class _Reader:
         return place
 
     def _is_input(self, parameter: Any, port: str, letter: str | None) -> bool:
-        """By its name as the coder makes it; else by C, where that tells; else by comments."""
+        """By its name as the coder makes it; else by its type in C; else by comments."""
         if letter:
             return letter == "U"
         if isinstance(parameter.type, c_ast.TypeDecl):

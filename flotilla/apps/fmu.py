@@ -129,7 +129,7 @@ class Unit:
     step_key: str
     """What says so."""
     failures: list[str] = field(default_factory=list)
-    """Categories of messages that it knows and that are heard in real time, too: after them the task ends."""
+    """Categories of messages that it knows and that are taken in real time, too: after them the task ends."""
     inputs: list[Variable] = field(default_factory=list)
     outputs: list[Variable] = field(default_factory=list)
     parameters: list[Variable] = field(default_factory=list)

@@ -56,21 +56,21 @@ class Connection:
         """Run it; what it says. UserError with the reason when it refuses or the robot does not answer."""
         with _started(self.argv(command, name, *arguments)) as process:
             try:
-                said, failure = process.communicate(stdin)
+                output, failure = process.communicate(stdin)
             except BaseException:
                 process.kill()
                 raise
         if process.returncode:
             raise self.error(process.returncode, failure.decode(errors="replace"))
-        return said.decode(errors="replace")
+        return output.decode(errors="replace")
 
     def stream(self, command: str, name: str, *arguments: str, stdin: Path, stdout: Path, log: Path) -> None:
         """Run it between two files; what it says besides is shown as it comes, and kept in `log`."""
         argv = [*DIE_WITH_PARENT, *self.argv(command, name, *arguments)]
         last = ""
         with stdin.open("rb") as given, stdout.open("wb") as made, log.open("w") as kept:
-            said = subprocess.PIPE
-            with subprocess.Popen(argv, stdin=given, stdout=made, stderr=said, text=True, errors="replace") as process:
+            pipe = subprocess.PIPE
+            with subprocess.Popen(argv, stdin=given, stdout=made, stderr=pipe, text=True, errors="replace") as process:
                 assert process.stderr
                 try:
                     for last in process.stderr:
@@ -82,17 +82,18 @@ class Connection:
         if process.returncode:
             raise self.error(process.returncode, f"{last.strip()}; what it said is above and in {paths.shown(log)}")
 
-    def error(self, status: int, said: str) -> UserError:
+    def error(self, status: int, message: str) -> UserError:
         """Why something failed on the robot, or on the way."""
-        name, said = self.robot.name, said.strip()
+        name, message = self.robot.name, message.strip()
         if status != 255:
-            return UserError(f"{name}: {said or f'status {status}'}")
-        if "Host key verification failed" in said or "IDENTIFICATION HAS CHANGED" in said:
+            return UserError(f"{name}: {message or f'status {status}'}")
+        if "Host key verification failed" in message or "IDENTIFICATION HAS CHANGED" in message:
             return UserError(
                 f"{name}: refused, because its host key is not the one of {paths.shown(paths.KEYS / 'known_hosts')}: "
-                "another robot's card is in it, its image was made with other keys, or somebody is in between\n" + said
+                "another robot's card is in it, its image was made with other keys, or somebody is in between\n"
+                + message
             )
-        return ssh.no_answer(self.robot, said or "the connection broke")
+        return ssh.no_answer(self.robot, message or "the connection broke")
 
 
 def _started(argv: Sequence[str]) -> subprocess.Popen[bytes]:
@@ -240,22 +241,23 @@ def run(to: Connection, name: str, show: Show) -> str:
     for line in to.run("rest", name, cursor).splitlines():
         take(line)
     _write(to, name, "log", "".join(f"{line}\n" for line in log))
-    said = report(to, name)
+    outcome = report(to, name)
     if ended and _ENDED[ended["MESSAGE_ID"]] != "success":
         result = ended.get("UNIT_RESULT", "it failed")
         remedy = f"its log is {paths.shown(_file(to, name, 'log'))}"
-        raise UserError("\n".join(filter(None, (said, f"{to.robot.name}: {name} ended: {result}; {remedy}"))))
-    return said
+        raise UserError("\n".join(filter(None, (outcome, f"{to.robot.name}: {name} ended: {result}; {remedy}"))))
+    return outcome
 
 
 def interrupted(to: Connection, name: str) -> str:
     """What the robot has of the app now: for whoever interrupted a command that may have changed it."""
     try:
-        told = dict(line.split("=", 1) for line in status(to, name).splitlines())
+        properties = dict(line.split("=", 1) for line in status(to, name).splitlines())
     except UserError as error:
         return str(error)
-    kept = "starts" if told["Kept"] == "yes" else "does not start"
-    return f"{to.robot.name}: {name} is {told['ActiveState']}, version {told['Version']}, and {kept} with the robot"
+    kept = "starts" if properties["Kept"] == "yes" else "does not start"
+    state, version = properties["ActiveState"], properties["Version"]
+    return f"{to.robot.name}: {name} is {state}, version {version}, and {kept} with the robot"
 
 
 def _message(entry: dict[str, Any]) -> str:

@@ -236,6 +236,32 @@ def _param_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("value", nargs="?", help="what to set it to; a negative one after --")
 
 
+def _scope(arguments: argparse.Namespace) -> None:
+    from flotilla.common import paths
+    from flotilla.fleet import inventory
+    from flotilla.robot import scope
+
+    robot = inventory.robot(inventory.load_fleet(), arguments.robot)
+    options = {name: getattr(arguments, name) for name in ("every", "rows", "trigger", "before")}
+    command = scope.words(arguments.task, arguments.signal, csv=arguments.csv is not None, **options)
+    if arguments.csv is None:
+        scope.show(robot, command)
+    else:
+        rows = scope.record(robot, command, arguments.csv)
+        print(f"{paths.shown(arguments.csv)}: {rows} rows")
+
+
+def _scope_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("task", help="or app, which runs on the robot")
+    parser.add_argument("signal", nargs="*", help="block.port or block.port[2]; without one, they are listed")
+    parser.add_argument("--every", type=int, metavar="N", help="only steps whose number is a multiple of N")
+    parser.add_argument("--rows", type=int, metavar="N", help="end after so many (when interrupted)")
+    parser.add_argument("--trigger", help="wait until a signal crosses a value: 'a.out>3' upwards, 'a.out<3' downwards")
+    parser.add_argument("--before", type=int, metavar="N", help="of the rows, so many are of the steps before that")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a table there")
+
+
 def _new_app(arguments: argparse.Namespace) -> None:
     from flotilla.apps import scaffold
 
@@ -296,6 +322,19 @@ def _top_arguments(parser: argparse.ArgumentParser) -> None:
     command.top_arguments(parser)
 
 
+def _report(arguments: argparse.Namespace) -> None:
+    from flotilla.common import paths
+    from flotilla.station import report
+
+    page = arguments.out or paths.BUILD / "reports" / f"{arguments.file.stem}.html"
+    print(f"{paths.shown(report.write(arguments.file, page))}: a page of {paths.shown(arguments.file)}")
+
+
+def _report_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="a recording of `make record`")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the page (build/reports/NAME.html)")
+
+
 def _provision(arguments: argparse.Namespace) -> None:
     from flotilla.robot import playbook
 
@@ -338,12 +377,14 @@ COMMANDS = (
     Command("Inputs", "rotate-key", "give a robot a new host key", _rotate_key, _rotate_key_arguments),
     Command("Robots", "ssh", "open a shell on a robot, or on its guest when one runs", _ssh, robot_argument),
     Command("Robots", "param", "read or set parameters of a running task or app", _param, _param_arguments),
+    Command("Robots", "scope", "print or record signals of a running task or app", _scope, _scope_arguments),
     Command("Robots", "releases", "show which release each robot runs", _releases, _releases_arguments),
     Command("Robots", "hwcheck", "report a robot's hardware", _hwcheck, _hwcheck_arguments),
     Command("Robots", "provision", "make robots what the inventory says", _provision, _provision_arguments),
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
     Command("Shell", "completion", "print what makes a shell complete these words", _completion,

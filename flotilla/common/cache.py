@@ -76,7 +76,9 @@ def _make(final: Path, make: Callable[[Path], None]) -> None:
             make(beside)
         beside.rename(final)
     finally:
-        discard(beside)
+        if beside.exists():  # a kernel's objects take seconds
+            with progress.step(f"remove {paths.shown(beside)}, which is not complete"):
+                discard(beside)
 
 
 def discard(directory: Path) -> None:

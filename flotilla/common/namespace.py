@@ -65,16 +65,16 @@ def check() -> None:
     what they write is awaited, but that of the program itself, and the rest of its group is killed.
     """
     argv = [*prefix(), "mount", "-t", "tmpfs", "none", "/mnt"]
-    with tempfile.TemporaryFile("w+") as said:
-        probe = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=said, stderr=said, process_group=0)
+    with tempfile.TemporaryFile("w+") as output:
+        probe = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0)
         try:
             os.waitid(os.P_PID, probe.pid, os.WEXITED | os.WNOWAIT)  # its number stays the group's until it is reaped
         finally:
             os.killpg(probe.pid, signal.SIGKILL)
             status = probe.wait()
-        said.seek(0)
+        output.seek(0)
         if status:
-            raise _refusal(said.read())
+            raise _refusal(output.read())
 
 
 def moved_clock() -> dict[str, str]:

@@ -51,7 +51,7 @@ class Far:
     """Of the total, where that says something."""
     part: str = ""
     """What runs now. Parts follow each other."""
-    said: str = ""
+    line: str = ""
     """The last line of work that itself shows its parts' ends."""
 
     @property
@@ -59,7 +59,7 @@ class Far:
         amount = f"{self._percent} %" if self.total else ""
         if self.unit:
             amount += f" of {self.total:g} {self.unit}"
-        return ", ".join(each for each in (self.part, self.said, amount) if each)
+        return ", ".join(each for each in (self.part, self.line, amount) if each)
 
     @property
     def _percent(self) -> int:
@@ -82,7 +82,7 @@ class Step:
         self._note = ""
         self._first: tuple[float, float] | None = None
         """When something was known first, and how much was done then: the rate counts from there."""
-        self._moved = self._part_began = self._told = self._shown = self.started
+        self._moved = self._part_began = self._written = self._shown = self.started
         self._ticks = 0
 
     def at(self, done: float, total: float, unit: str = "", part: str = "") -> None:
@@ -118,21 +118,21 @@ class Step:
         if far.done != before.done:
             self._moved = now
         if not _moving():
-            self._tell(before, now)
+            self._write_ends(before, now)
         if far.part != before.part:
             self._part_began = now
 
-    def _tell(self, before: Far, now: float) -> None:
+    def _write_ends(self, before: Far, now: float) -> None:
         """Where nothing moves: what has ended."""
         if before.part and self._far.part != before.part:
             self._line(f"{before.part}: {now - self._part_began:.1f} s", now)
-        elif self._far.said and self._far.said != before.said:
-            self._line(self._far.said, now)
-        elif not self._far.part and self._far.quarter > before.quarter and now - self._told >= _QUIET_S:
+        elif self._far.line and self._far.line != before.line:
+            self._line(self._far.line, now)
+        elif not self._far.part and self._far.quarter > before.quarter and now - self._written >= _QUIET_S:
             self._line(f"{self._far.text} after {clock(now - self.started)}", now)
 
     def _line(self, text: str, now: float) -> None:
-        self._told = now
+        self._written = now
         left = f"; {self._left()}" if self._left() else ""
         say(f"{self.title}: {text}{left}")
 
@@ -154,12 +154,12 @@ class Step:
     def _picture(self) -> str:
         """One line of the terminal, whatever its width."""
         passed = clock(_now() - self.started)
-        said = ", ".join(each for each in (self._far.text, self._note, passed, self._left()) if each)
+        state = ", ".join(each for each in (self._far.text, self._note, passed, self._left()) if each)
         spinner = _SPINNER[self._ticks % len(_SPINNER)]
         width = shutil.get_terminal_size().columns - 1
-        room = max(width - len(f"{spinner} : {said}"), _TITLE)  # how far it is matters more than its whole title
+        room = max(width - len(f"{spinner} : {state}"), _TITLE)  # how far it is matters more than its whole title
         title = self.title if len(self.title) <= room else f"{self.title[: room - 1]}…"
-        line = f"{spinner} {title}: {said}"[:width]
+        line = f"{spinner} {title}: {state}"[:width]
         return f"\033[36m{line[:1]}\033[0m{line[1:]}" if _COLOUR else line
 
 

@@ -107,10 +107,10 @@ def board(name: str) -> str | None:
     """The only board that an app of this checkout is for, as its description says. What is wrong with a description is
     said when it is built."""
     try:
-        told = yaml.safe_load((paths.APPS / name / FILE).read_text(encoding="utf-8"))
+        described = yaml.safe_load((paths.APPS / name / FILE).read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError):
         return None
-    found = told.get("board") if isinstance(told, dict) else None
+    found = described.get("board") if isinstance(described, dict) else None
     return found if isinstance(found, str) else None
 
 

@@ -23,9 +23,9 @@ def problems(description: object, fleet: Fleet, robot: Robot) -> Iterator[str]:
         if kind not in (*_CAN_BLOCKS, *_UDP_BLOCKS):
             continue
         parameters = block.get("parameters")
-        told = parameters.get("interface") if isinstance(parameters, dict) else None
+        interface = parameters.get("interface") if isinstance(parameters, dict) else None
         if kind in _CAN_BLOCKS:
-            used = told or "can0"
+            used = interface or "can0"
             if used not in robot.can:
                 others = f"{' or '.join(robot.can)}, or " if robot.can else ""
                 yield (
@@ -34,9 +34,9 @@ def problems(description: object, fleet: Fleet, robot: Robot) -> Iterator[str]:
                 )
             continue
         own = fleet.interface(robot)
-        if told and told not in (own, "lo"):
+        if interface and interface not in (own, "lo"):
             yield (
-                f"blocks.{name}.parameters.interface: {robot.name} has no address on {told}; "
+                f"blocks.{name}.parameters.interface: {robot.name} has no address on {interface}; "
                 f"{own}, lo, or leave it out for any"
             )
         local = parameters.get("local_address") if isinstance(parameters, dict) else None

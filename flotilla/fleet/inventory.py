@@ -77,7 +77,8 @@ def summary(fleet: Fleet) -> str:
             robot.name,
             robot.board,
             str(robot.address),
-            ", ".join(f"{name} on {device.port}" for name, device in robot.devices.items()) or "no devices",
+            ", ".join(f"{name} on {device.port or device.usb}" for name, device in robot.devices.items())
+            or "no devices",
         )
         for number, robot in fleet.robots.items()
     ]
@@ -126,8 +127,8 @@ def _ansible_inventory(directory: Path) -> str:
     except FileNotFoundError:
         raise UserError(f"{program}: not installed; run `make setup`") from None
     if done.returncode:
-        said = done.stderr.partition("Traceback")[0].strip()
-        raise UserError(f"{paths.shown(directory)}: Ansible cannot read the inventory:\n{said}")
+        message = done.stderr.partition("Traceback")[0].strip()
+        raise UserError(f"{paths.shown(directory)}: Ansible cannot read the inventory:\n{message}")
     return done.stdout
 
 
@@ -169,7 +170,7 @@ class Sources:
         return sorted({name for kind, name in self._entries if kind == "group_vars" and name.startswith("board_")})
 
     def described(self, board: str) -> Any:
-        """What `group_vars/` says of a board's group: Ansible tells variables of hosts only, and this may have none."""
+        """What `group_vars/` has of a board's group: Ansible lists variables of hosts only, and it may have none."""
         for entry in reversed(self._entries.get(("group_vars", board), [])):
             if found := child(entry.node, "board"):
                 return yaml.SafeLoader("").construct_document(found[1])
@@ -457,6 +458,23 @@ def _devices(raw: dict[str, Any]) -> Iterator[Finding]:
                 yield loc, f"the board {robot['board']} has no such port", _free(ports, used.values(), console)
             elif console and ports[port].get("tty") == console:
                 yield loc, f"is the console's port ({console})", _free(ports, used.values(), console)
+        yield from _plugged(name, robot.get("devices", {}))
+
+
+def _plugged(robot: str, devices: dict[str, Any]) -> Iterator[Finding]:
+    """Each device is at a port or on USB, and USB tells each from the others."""
+    identities: dict[Loc, str] = {}
+    for device, plug in devices.items():
+        loc: Loc = ("robots", robot, "devices", device)
+        if bool(plug.get("port")) == bool(plug.get("usb")):
+            wrong = "is both at a port and on USB" if plug.get("port") else "is plugged into nothing: port is missing"
+            yield loc, wrong, "either port, such as COM5, or usb, such as '15d1:0000'"
+        elif plug.get("usb"):
+            identities[(*loc, "usb")] = plug["usb"]
+    for loc, identity in identities.items():
+        for other, another in identities.items():
+            if loc != other and identity.startswith(another) and (len(identity) > len(another) or other < loc):
+                yield loc, f"is also {other[3]}'s", "the serial number of each behind it, such as '0403:6001/A9XYZ'"
 
 
 def _named(raw: dict[str, Any], robot: str, key: str) -> dict[Loc, str]:
@@ -548,8 +566,8 @@ def _boards(raw: dict[str, Any]) -> Iterator[Finding]:
 
         # 8250.nr_uarts: Debian's kernels make 4 ports unless told so (SERIAL_8250_RUNTIME_UARTS) and 32 at most.
         arguments = " ".join(map(str, board.get("kernel_arguments", ())))
-        told = re.search(r"8250\.nr_uarts=(\d+)", arguments)
-        uarts = int(told[1]) if told else 4
+        limit = re.search(r"8250\.nr_uarts=(\d+)", arguments)
+        uarts = int(limit[1]) if limit else 4
         needed = 1 + max((int(tty[4:]) for tty in ttys.values() if tty.startswith("ttyS")), default=-1)
         if needed > uarts and "kernel_arguments" in board:
             loc = ("boards", name, "kernel_arguments")

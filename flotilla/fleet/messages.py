@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from flotilla.common import paths
 from flotilla.common.errors import Problem
 from flotilla.common.yaml_file import Entry, Loc, compose, dotted, explained, plain
+from flotilla.fleet.drawings import Drawing, DrawingError
 from flotilla.fleet.model import MESSAGE_BYTES, STATIONS, Message, TaskName
 
 Messages = Mapping[str, Message]
@@ -118,8 +119,18 @@ def _streams(name: str, message: Message, messages: Messages) -> Iterator[Findin
             yield ("standby",), "stations tell robots apart, and get what each sends", "remove it"
         if message.charge and (not charge or charge.width > 1 or charge.type not in ("single", "double")):
             yield ("charge",), "is not a signal of one single or double", "one of signals, or remove it"
+    elif message.foxglove:
+        yield ("foxglove",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
     elif message.charge:
         yield ("charge",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
+
+
+def _drawings(name: str, message: Message, messages: Messages) -> Iterator[Finding]:
+    for drawing, drawn in message.foxglove.items():
+        try:
+            Drawing(drawn, message.signals)
+        except DrawingError as error:
+            yield ("foxglove", drawing, *error.loc), error.wrong, error.remedy
 
 
 def _signals(name: str, message: Message, messages: Messages) -> Iterator[Finding]:
@@ -147,4 +158,4 @@ def _signals(name: str, message: Message, messages: Messages) -> Iterator[Findin
             yield ("signals", signal), f"is the same as {other} to protobuf", "a name that differs in more than _"
 
 
-_CHECKS = (_tasks, _ports, _rates, _deadlines, _streams, _signals)
+_CHECKS = (_tasks, _ports, _rates, _deadlines, _streams, _drawings, _signals)

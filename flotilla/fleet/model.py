@@ -87,6 +87,14 @@ Interface = Annotated[
         r"[a-z][a-z0-9]{0,14}", "is not a network interface's name", "such as eth0 or wlan0, at most 15 characters"
     ),
 ]
+UsbIdentity = Annotated[
+    str,
+    matching(
+        r"|[0-9a-f]{4}:[0-9a-f]{4}(/[A-Za-z0-9_.-]{1,64})?",
+        "is not who a USB device is",
+        "vendor and product in quotes, small hexadecimal digits, such as '15d1:0000', and /SERIAL if it has one",
+    ),
+]
 CanInterface = Annotated[
     str,
     matching(r"can[0-9]", "is not a CAN interface's name", "can0 to can9, as the kernel names the board's channels"),
@@ -147,6 +155,9 @@ SignalName = Annotated[
 Word = Annotated[str, matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
 Architecture = Literal["i386", "amd64"]
 """Debian's names of the processor architectures that boards may have."""
+Processor = Annotated[
+    str, matching(r"[a-z0-9][a-z0-9._-]*", "is not a value of GCC's -march", "such as pentium3, see `man gcc`")
+]
 Module = Annotated[str, matching(r"[A-Za-z0-9_]+", "is not a kernel module's name", "such as ata_piix, without .ko")]
 
 
@@ -251,6 +262,9 @@ class Board(_Model):
     """The computer in one line, for reports."""
     architecture: Architecture
     """Debian's name of the processor architecture."""
+    processor: Processor | None = None
+    """Processor for which programs that measure the board are compiled: a value of GCC's `-march`. Leave it out for
+    the oldest one of the architecture."""
     kernel: Literal["debian", "lean"]
     """`debian`: Debian's real-time kernel. `lean`: the one that `make kernel` builds from `kernel/NAME.yml`."""
     kernel_arguments: list[Word]
@@ -345,6 +359,9 @@ class Network(_Model):
     """UDP ports or ranges that robots accept from fleet addresses. DDS and SSH need no entry."""
     transport: Literal["udp", "dds"] = "udp"
     """Transport of messages between control tasks of several robots: UDP datagrams, or topics of Cyclone DDS."""
+    update_kbit_s: Annotated[Integer, between(10, 1_000_000, unit="kbit/s")] = 300
+    """Rate at which a station sends an update to several robots at once, headers included. The default is 30 % of the
+    lowest rate of 802.11b, at which multicast goes: the rest is for control."""
 
 
 class Health(_Model):
@@ -380,10 +397,13 @@ class Releases(_Model):
 
 
 class Device(_Model):
-    """Something plugged into a serial port. Its name becomes `/dev/robot/NAME`."""
+    """Something plugged into a serial port, or into USB as one. Its name becomes `/dev/robot/NAME`."""
 
-    port: str
-    """The connector's name in the board's `ports`."""
+    port: str = ""
+    """The connector's name in the board's `ports`. Give this, or `usb`."""
+    usb: UsbIdentity = ""
+    """Who it is on USB, in whichever socket: vendor and product as `lsusb` shows them, `15d1:0000` for a Hokuyo URG.
+    Where a robot has several of a kind, also the serial number, `0403:6001/A9XYZ`."""
     baud: Baud
     """Bit rate, as the device's manual says."""
 
@@ -450,6 +470,18 @@ class Signal(_Model):
     The name of an integer says its unit, such as `sensed_ns`."""
 
 
+class Drawn(_Model):
+    """A message of Foxglove's that is made of a message's signals, so that viewers draw it."""
+
+    type: Word
+    """Foxglove's schema, such as `PoseInFrame` or `LaserScan`."""
+    constants: dict[str, Any] = {}
+    """Members that never change, as in JSON: `{ frame_id: fleet }`."""
+    signals: dict[str, Word] = {}
+    """Signals by member: `pose.position.x: "state[0]"`. A quaternion takes a heading in rad, a timestamp an int64 in
+    ns; without a signal it is the time of reception."""
+
+
 class Message(_Model):
     """What one control task sends to another, or to the stations: one entry of `ansible/control_tasks/messages.yml`.
 
@@ -473,6 +505,8 @@ class Message(_Model):
     """`true`: another robot may be a hot standby for the sender."""
     charge: SignalName | None = None
     """Signal that is a battery's state of charge, 0 to 1. `make top` shows it."""
+    foxglove: dict[SignalName, Drawn] = {}
+    """What viewers draw of it, by name: `pose` of `control-report` becomes the topic `/robot3/control/report/pose`."""
     signals: dict[SignalName, Signal]
     """The values, in the order of their bytes."""
 

@@ -30,6 +30,8 @@ EXAMPLES = {
     "queue-receive": ["name=/heading"],
     "queue-send": ["name=/heading"],
     "recorder": ["types=[double, uint8]"],
+    "ros-publish": ["type=sensor_msgs/msg/LaserScan", "topic=scan", "lengths=[682]"],
+    "ros-subscribe": ["type=geometry_msgs/msg/Twist", "topic=cmd_vel"],
     "thruster-mapping": [
         "positions=[0.15, 0.15, 0.15, 0.15, -0.15, 0.15, -0.15, 0.15, "
         "-0.15, -0.15, -0.15, -0.15, 0.15, -0.15, 0.15, -0.15]",

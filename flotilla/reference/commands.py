@@ -49,8 +49,8 @@ def _words(action: argparse.Action) -> str:
 
 def _help(own: argparse.ArgumentParser, action: argparse.Action) -> str:
     """With the default where the text asks for it, and no path of this computer."""
-    said = own._get_formatter()._expand_help(action)
-    return said.replace(f"{paths.PROJECT}{os.sep}", "")
+    text = own._get_formatter()._expand_help(action)
+    return text.replace(f"{paths.PROJECT}{os.sep}", "")
 
 
 def _targets() -> str:

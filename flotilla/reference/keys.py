@@ -18,7 +18,7 @@ from flotilla.reference.markdown import MADE, code, table
 from images.builder import card, kernel, lock
 
 _PLAIN = {
-    bool: "boolean", int: "integer", float: "number", str: "string", IPv4Address: "IPv4 address",
+    Any: "anything", bool: "boolean", int: "integer", float: "number", str: "string", IPv4Address: "IPv4 address",
     IPv4Network: "IPv4 network",
 }  # fmt: skip
 
@@ -104,9 +104,9 @@ def _value(hint: Any) -> Value:
     if origin is Annotated:
         value = _value(arguments[0])
         checks = [each for each in arguments[1:] if isinstance(each, Check)]
-        said = "; ".join(check.right for check in checks)
+        rules = "; ".join(check.right for check in checks)
         unit = next((check.unit for check in checks if check.unit), "")
-        return Value(f"{value.text}: {said}", unit) if checks else value
+        return Value(f"{value.text}: {rules}", unit) if checks else value
     if origin in (Union, types.UnionType):
         return _value(next(each for each in arguments if each is not types.NoneType))
     if origin is Literal:

@@ -80,7 +80,9 @@ def check(robot: Robot, seconds: int) -> str:
     file = paths.BUILD / "reports" / f"hwcheck-{robot.name}.txt"
     file.parent.mkdir(parents=True, exist_ok=True)
     text = summary(found)
-    sections = [f"== {name}{f' (status {status})' if status else ''}\n{said}" for name, (status, said) in found.items()]
+    sections = [
+        f"== {name}{f' (status {status})' if status else ''}\n{output}" for name, (status, output) in found.items()
+    ]
     beside = file.with_suffix(".new")
     beside.write_text("\n".join([f"== summary\n{text}\n", *sections]))
     beside.rename(file)

@@ -17,15 +17,15 @@ def param(robot: Robot, task: str, parameter: str | None = None, value: str | No
     UserError with the robot's reason, or when it does not answer.
     """
     words = ["flotilla-param", task, *([parameter] if parameter else []), *([value] if value is not None else [])]
-    return _said(robot, words)
+    return _output(robot, words)
 
 
 def service(robot: Robot, task: str, do: str) -> str:
     """Start or stop a control task, as the playbook `tasks.yml` does. UserError as above."""
-    return _said(robot, ["sudo", "systemctl", do, f"flotilla-task@{task}.service"])
+    return _output(robot, ["sudo", "systemctl", do, f"flotilla-task@{task}.service"])
 
 
-def _said(robot: Robot, words: list[str]) -> str:
+def _output(robot: Robot, words: list[str]) -> str:
     argv = [*ssh.command(robot), shlex.join(words)]
     done = subprocess.run(argv, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False)
     if done.returncode == ssh.FAILED:

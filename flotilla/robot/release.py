@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import struct
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,17 @@ class Bundle:
             left = int(self.header["BYTES"])
             while left:
                 left -= out.write(file.read(min(left, 1 << 20)))
+
+    def length(self, numbers: Sequence[int]) -> int:
+        """Bytes of these chunks."""
+        described = json.loads(self.manifest)
+        length, size = int(described["chunk_bytes"]), int(described["header"]["BYTES"])
+        return sum(min(length, size - number * length) for number in numbers)
+
+    def delta(self, told: Mapping[str, Any]) -> Path | None:
+        """The delta for a robot that said `told`; None where there is none, or what it lacks is less."""
+        file = delta_of(told["base"], self.header["BLOB"])
+        return file if file.exists() and file.stat().st_size < self.length(told["missing"]) else None
 
     def chunks(self, numbers: Sequence[int], batch_bytes: int) -> Iterator[bytes]:
         """These chunks as the robot's `write` reads them, about `batch_bytes` at a time."""

@@ -107,21 +107,21 @@ def _ask(robot: Robot, now: datetime | None) -> Answer:
         return Answer(robot, problem=str(error))
     except subprocess.TimeoutExpired:
         return Answer(robot, problem=str(ssh.no_answer(robot, f"nothing in {_TIMEOUT_S:.0f} s")))
-    said = (done.stderr.strip().splitlines() or [""])[-1]
+    message = (done.stderr.strip().splitlines() or [""])[-1]
     if done.returncode == ssh.FAILED:
-        return Answer(robot, problem=str(ssh.no_answer(robot, said)))
-    if done.returncode in _NO_PROGRAM and "not found" in said:
+        return Answer(robot, problem=str(ssh.no_answer(robot, message)))
+    if done.returncode in _NO_PROGRAM and "not found" in message:
         remedy = f"its card is older than releases: flash it again, `make flash ROBOT={robot.number}`"
         return Answer(robot, problem=f"{robot.name}: has no flotilla-slot; {remedy}")
     if done.returncode:
-        return Answer(robot, problem=f"{robot.name}: flotilla-slot: {said or f'status {done.returncode}'}")
+        return Answer(robot, problem=f"{robot.name}: flotilla-slot: {message or f'status {done.returncode}'}")
     return _read(robot, done.stdout, now or datetime.now().astimezone())
 
 
 def _read(robot: Robot, text: str, now: datetime) -> Answer:
     try:
-        uptime, _, said = text.partition("\n")
-        state = State.model_validate_json(said)
+        uptime, _, shown = text.partition("\n")
+        state = State.model_validate_json(shown)
         return Answer(robot, state, now - timedelta(seconds=float(uptime.split()[0])))
     except pydantic.ValidationError as error:
         first = error.errors()[0]

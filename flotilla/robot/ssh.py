@@ -60,9 +60,9 @@ def options(robot: Robot) -> list[str]:
     return [word for name, value in settings.items() for word in ("-o", f'{name}="{value}"')]
 
 
-def no_answer(robot: Robot, said: str) -> UserError:
-    """That a command by `command` did not reach the robot, or broke off; `said`: what there is to say about it."""
-    return UserError(f"{robot.name} did not answer: {said}; is it on and reachable? `make ssh ROBOT={robot.number}`")
+def no_answer(robot: Robot, reason: str) -> UserError:
+    """That a command by `command` did not reach the robot, or broke off; `reason`: in the words of whoever found it."""
+    return UserError(f"{robot.name} did not answer: {reason}; is it on and reachable? `make ssh ROBOT={robot.number}`")
 
 
 def forwarded_port(robot: Robot) -> int | None:

@@ -13,6 +13,7 @@ import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from flotilla.common.errors import UserError
+from flotilla.fleet.drawings import Drawing
 from flotilla.station import schema
 from flotilla.station.recording import Value
 from flotilla.station.telemetry import Stream
@@ -41,14 +42,16 @@ class Server:
         self._context = foxglove.Context()  # which channels and server do not hold on to
         self._listener = _Listener()
         self._served = 0
-        self._channels: dict[str, tuple[foxglove.Channel, schema.Schema]] = {}
+        self._channels: dict[str, list[tuple[foxglove.Channel, schema.Schema | Drawing]]] = {}
+        """By stream."""
         for stream in known:
-            own = schema.Schema(stream)
-            described = foxglove.Schema(name=own.name, encoding=schema.ENCODING, data=own.data)
-            channel = foxglove.Channel(
-                stream.topic, schema=described, message_encoding=schema.ENCODING, context=self._context
-            )
-            self._channels[stream.topic] = (channel, own)
+            channels = self._channels[stream.topic] = []
+            for topic, own in schema.topics(stream).items():
+                described = foxglove.Schema(name=own.name, encoding=schema.ENCODING, data=own.data)
+                channel = foxglove.Channel(
+                    topic, schema=described, message_encoding=schema.ENCODING, context=self._context
+                )
+                channels.append((channel, own))
         try:
             self._server = foxglove.start_server(
                 name="flotilla", host=address, port=port, server_listener=self._listener, context=self._context
@@ -62,10 +65,10 @@ class Server:
         sys.stderr.flush()
 
     def take(self, stream: Stream, values: Mapping[str, Value], received_ns: int) -> None:
-        channel, own = self._channels[stream.topic]
-        if channel.has_sinks():
-            channel.log(own.encode(values), log_time=received_ns)
-            self._served += 1
+        for channel, own in self._channels[stream.topic]:
+            if channel.has_sinks():
+                channel.log(own.encode(values, received_ns), log_time=received_ns)
+                self._served += 1
 
     def refresh(self) -> None:
         """Nothing to do: every message leaves at once."""

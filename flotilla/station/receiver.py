@@ -110,8 +110,10 @@ def receive(
     note: Callable[[str], None] | None,
     others: Mapping[int, Callable[[], bool]] = MappingProxyType({}),
 ) -> None:
-    """Until SIGINT or SIGTERM, or for so many seconds; `note` is told how far it is. `others`: what to call when a file
-    descriptor is readable, until it returns False."""
+    """Until SIGINT or SIGTERM, or for so many seconds; `note` is called with how far it is.
+
+    `others`: what to call when a file descriptor is readable, until it returns False.
+    """
     readers = dict(others)
     by_fd = {one.fileno(): one for one in sockets}
     wake, waker = socket.socketpair()

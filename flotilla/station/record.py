@@ -16,8 +16,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
+from flotilla.fleet.drawings import Drawing
 from flotilla.station.recording import Value
-from flotilla.station.schema import ENCODING, Schema
+from flotilla.station.schema import ENCODING, Schema, topics
 from flotilla.station.telemetry import Stream
 
 
@@ -37,21 +38,22 @@ class Recorder:
         # Of what never is in it, no index either: a reader takes an empty one for a fault.
         indexes = IndexType.CHUNK | IndexType.MESSAGE
         self._writer = Writer(self._file, compression=CompressionType.LZ4, index_types=indexes)
-        self._channels: dict[str, tuple[int, Schema]] = {}
+        self._channels: dict[str, dict[str, tuple[int, Schema | Drawing]]] = {}
+        """By stream, and by topic of what is made of it."""
         with self._writing():
             self._writer.start(profile="", library="flotilla")
             for stream in known:
-                schema = Schema(stream)
-                number = self._writer.register_schema(schema.name, ENCODING, schema.data)
-                self._channels[stream.topic] = (self._writer.register_channel(stream.topic, ENCODING, number), schema)
+                channels = self._channels[stream.topic] = {}
+                for topic, schema in topics(stream).items():
+                    number = self._writer.register_schema(schema.name, ENCODING, schema.data)
+                    channels[topic] = (self._writer.register_channel(topic, ENCODING, number), schema)
 
     def take(self, stream: Stream, values: Mapping[str, Value], received_ns: int) -> None:
-        channel, schema = self._channels[stream.topic]
-        with self._writing():
-            self._writer.add_message(
-                channel, received_ns, schema.encode(values), received_ns, sequence=self._recorded[stream.topic]
-            )
-        self._recorded[stream.topic] += 1
+        for topic, (channel, schema) in self._channels[stream.topic].items():
+            data = schema.encode(values, received_ns)
+            with self._writing():
+                self._writer.add_message(channel, received_ns, data, received_ns, sequence=self._recorded[topic])
+            self._recorded[topic] += 1
 
     def refresh(self) -> None:
         """What was taken so far is in the file then."""

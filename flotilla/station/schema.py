@@ -7,6 +7,7 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
+from flotilla.fleet.drawings import Drawing
 from flotilla.station.recording import Value
 from flotilla.station.telemetry import Stream
 
@@ -40,11 +41,17 @@ class Schema:
         """A FileDescriptorSet."""
         self._message: type[Any] = message_factory.GetMessageClass(pool.FindMessageTypeByName(self.name))
 
-    def encode(self, values: Mapping[str, Value]) -> bytes:
+    def encode(self, values: Mapping[str, Value], received_ns: int) -> bytes:
         """A message of these values, which `Stream.unpack` gave."""
         message = self._message(**{_identifier(name): value for name, value in values.items()})
         encoded: bytes = message.SerializeToString()
         return encoded
+
+
+def topics(stream: Stream) -> dict[str, Schema | Drawing]:
+    """What recordings and viewers have of a stream: itself, and what they draw of it."""
+    drawings = {f"{stream.topic}/{name}": drawing for name, drawing in stream.drawings.items()}
+    return {stream.topic: Schema(stream), **drawings}
 
 
 def _identifier(name: str) -> str:

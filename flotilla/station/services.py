@@ -52,8 +52,8 @@ def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
     longest = 1 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
-    tell = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
-    script = f"while cat /proc/uptime && {show} && {{ {tell}; }} && echo {_END}; do sleep {ASK_S}; done"
+    status = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
+    script = f"while cat /proc/uptime && {show} && {{ {status}; }} && echo {_END}; do sleep {ASK_S}; done"
     before: dict[str, State] = {}
     program, *way = ssh.command(robot)
     options = [word for setting in _SETTINGS for word in ("-o", setting)]
@@ -79,9 +79,9 @@ def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
             process.kill()
 
 
-def _states(said: list[str], reported: list[str], before: dict[str, State]) -> dict[str, State]:
+def _states(lines: list[str], reported: list[str], before: dict[str, State]) -> dict[str, State]:
     """What one round says: /proc/uptime, then the services, an empty line between them; and the tasks, a line each."""
-    uptime, _, shown = "".join(said).partition("\n")
+    uptime, _, shown = "".join(lines).partition("\n")
     reports = {report["task"]: report for report in map(json.loads, reported) if report}
     found = {}
     for block in shown.strip().split("\n\n"):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
+from flotilla.fleet.drawings import Drawing
 from flotilla.fleet.model import STATIONS, Fleet, Message
 from flotilla.station.recording import Field, Value
 
@@ -28,6 +29,8 @@ class Stream:
     """Steps of the task from one datagram to the next."""
     charge: str | None = None
     """The field that is a battery's state of charge, 0 to 1."""
+    drawings: Mapping[str, Drawing] = field(default_factory=dict, compare=False)
+    """What viewers draw of it, by name; `pose` has the topic `/robot1/valves/report/pose`."""
 
     @property
     def length(self) -> int:
@@ -62,6 +65,7 @@ def streams(fleet: Fleet) -> list[Stream]:
             step_s=message.step_s,
             every=message.every,
             charge=message.charge,
+            drawings={name: Drawing(drawn, message.signals) for name, drawn in message.foxglove.items()},
         )
         for robot in fleet.robots.values()
         for task in robot.control_tasks

@@ -16,8 +16,10 @@ from flotilla.robot.release import Bundle, delta_of
 from images.builder import pool, tools
 from images.builder.lock import read_lock
 
-WINDOW = 1 << 20
+WINDOW = 1 << 18
 """Bytes of the release that a robot makes at a time; `flotilla-patch` has memory for no more."""
+LEAST_SOURCE = 1 << 20
+"""Bytes that xdelta3 is told to keep of a base, at least."""
 
 
 def command() -> list[str]:
@@ -33,7 +35,7 @@ def make(base: Path, release: Path, delta: Path) -> None:
     unfinished = delta.with_name(f"{delta.name}.part")
     # All of the base at once: whatever moved is found. Neither names nor checksums, which only xdelta3 would read, nor
     # compression, since both releases are compressed.
-    window = 1 << max(base.stat().st_size - 1, WINDOW).bit_length()
+    window = 1 << max(base.stat().st_size - 1, LEAST_SOURCE).bit_length()
     argv = [*command(), "-e", "-f", "-9", "-n", "-A", "-S", "none", "-B", str(window), "-W", str(WINDOW)]
     argv += ["-s", str(base), str(release), str(unfinished)]
     progress.command(argv)

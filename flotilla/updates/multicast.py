@@ -31,7 +31,7 @@ import sys
 import time
 import zlib
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from ipaddress import IPv4Address
@@ -67,6 +67,8 @@ _MOST_LOSS = 0.5
 """More loss than that is not made up for in advance."""
 _FACTOR = 4.0
 """Symbols sent, as a multiple of the file's: after that the file is not sent any further."""
+_TOLD_S = 1.0
+"""Between two reports to whoever watches."""
 _BLOCKS_HELD = 4
 """Blocks whose symbols stay in memory."""
 _WORDS = BLOCK // 64
@@ -154,7 +156,7 @@ class _Robot:
 
 @dataclass(frozen=True)
 class Report:
-    """What became of a transfer."""
+    """What became of a transfer, or how far it is."""
 
     whole: list[str]
     """Addresses of the robots that have the file."""
@@ -223,31 +225,39 @@ class Sender:
             self._blocks[block] = Block(self._content[block * BLOCK * SYMBOL : (block + 1) * BLOCK * SYMBOL])
         return self._blocks[block]
 
-    def run(self) -> Report:
-        """Send; errors of the network are waited out."""
-        began = time.monotonic()
-        self._ask()
-        while True:
-            self._listen()
-            if self._asked_at is not None and self._is_answered():
-                self._plan()
-            if self._asked_at is None and (self._sent_since or not (self._jobs or self._fresh)):
-                if self._is_over():
-                    break
-                self._ask()
-            elif not self._send_next():
-                self._listen(self._left_s())
-        for _ in range(3):  # a robot that hears none of them ends by itself
-            self._send(_HEADER.pack(self._transfer, _END, 0))
-        self._selector.close()
-        self._socket.close()
+    def run(self, watch: Callable[[Report], object] = lambda report: None) -> Report:
+        """Send; errors of the network are waited out.
+
+        `watch` is told how far it is, about once a second; what it raises ends the transfer.
+        """
+        began = told = time.monotonic()
+        with self._selector, self._socket:
+            self._ask()
+            while True:
+                self._listen()
+                if self._asked_at is not None and self._is_answered():
+                    self._plan()
+                if self._asked_at is None and (self._sent_since or not (self._jobs or self._fresh)):
+                    if self._is_over():
+                        break
+                    self._ask()
+                elif not self._send_next():
+                    self._listen(self._left_s())
+                if time.monotonic() - told >= _TOLD_S:
+                    told = time.monotonic()
+                    watch(self._report(told - began))
+            for _ in range(3):  # a robot that hears none of them ends by itself
+                self._send(_HEADER.pack(self._transfer, _END, 0))
+        return self._report(time.monotonic() - began)
+
+    def _report(self, seconds: float) -> Report:
         lacking = {
             address: None if address in self._never else SYMBOL * sum(robot.needs.values())
             for address, robot in self._robots.items()
             if robot.needs
         }
         whole = [address for address, robot in self._robots.items() if not robot.needs]
-        return Report(whole, lacking, self._bytes_sent, round(time.monotonic() - began, 3))
+        return Report(whole, lacking, self._bytes_sent, round(seconds, 3))
 
     def _is_over(self) -> bool:
         """Everybody has the file or was silent for long, or more was sent than any hope is worth."""

@@ -151,10 +151,13 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
     return cache.result("card", key, make)
 
 
-def tries_block() -> bytes:
-    """The first sectors of the boot state: a tar header (POSIX.1-1988, ustar), and behind it no tries."""
+def tries_block(name: str = "tries") -> bytes:
+    """The first sectors of the boot state: a tar header (POSIX.1-1988, ustar), and behind it no tries.
+
+    `name`: of the file; GRUB writes to `tries` alone.
+    """
     header = bytearray(SECTOR)
-    fields = {0: "tries", 100: "0000644", 108: "0000000", 116: "0000000", 124: f"{SECTOR:011o}", 136: "0" * 11,
+    fields = {0: name, 100: "0000644", 108: "0000000", 116: "0000000", 124: f"{SECTOR:011o}", 136: "0" * 11,
               148: " " * 8, 156: "0", 257: "ustar", 263: "00"}  # fmt: skip
     for place, text in fields.items():
         header[place : place + len(text)] = text.encode()

@@ -331,7 +331,7 @@ def write(
         parts=[*same.parts, data],
         partitions=partitions(extents),
         packages=same.packages,
-        apps=[told(app) for app in apps],
+        apps=[entry_of(app) for app in apps],
         hostvars=hostvars(fleet, robot),
     )
     file_of(beside).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
@@ -344,8 +344,8 @@ def write(
             shutil.copyfile(bill, beside.with_suffix(f".{ending}"))
 
 
-def told(app: BuiltApp) -> App:
-    """What a manifest says of an app."""
+def entry_of(app: BuiltApp) -> App:
+    """An app in a manifest."""
     return App(name=app.name, version=app.version, bytes=app.bytes, sha256=app.sha256)
 
 

@@ -84,10 +84,10 @@ def _advice(archive: str) -> str:
 def _suites(os_release: Path) -> str:
     """A pattern of the names that suites of this computer's Debian have; none elsewhere, where sources are others'."""
     text = os_release.read_text() if os_release.is_file() else ""
-    said = dict(re.findall(r"""^(\w+)=["']?(.*?)["']?$""", text, re.MULTILINE))
-    if said.get("ID") != "debian":
+    values = dict(re.findall(r"""^(\w+)=["']?(.*?)["']?$""", text, re.MULTILINE))
+    if values.get("ID") != "debian":
         return ""
-    own = said.get("VERSION_CODENAME")
+    own = values.get("VERSION_CODENAME")
     return f"{_ALWAYS}|{re.escape(own)}" if own else _ALWAYS
 
 

@@ -62,42 +62,44 @@ def build(board: Board, root: Path, keys: bytes, numbers: Release) -> Path:
         Path(card.__file__), Path(environment_block.__file__), str(card.LAYOUT),
     )  # fmt: skip
 
-    def make(out: Path) -> None:
-        squashfs, blob = root / "root.squashfs", out / "slot.img"
-        shutil.copyfile(squashfs, blob)
-        parts = {name: root / file for name, file in _NAMES.items() if (root / file).exists()}
-        (out / "release_keys").write_bytes(keys)
-        places = dict.fromkeys(_NAMES, "")
-        with blob.open("r+b") as whole:
-            for name, file in (parts | {"KEYS": out / "release_keys"}).items():
-                start = whole.seek(-(-whole.seek(0, 2) // _ALIGNMENT) * _ALIGNMENT)
-                content = file.read_bytes()
-                whole.write(content)
-                places[name] = f"{start // card.SECTOR}+{-(-len(content) // card.SECTOR)}"
-            whole.truncate(-(-whole.seek(0, 2) // _ALIGNMENT) * _ALIGNMENT)
-        size = blob.stat().st_size
-        room = card.SLOTS[0].size - card.HEADER_ROOM
-        if size > room:
-            raise UserError(
-                f"the root file system of {board.name} and its kernel are {size} bytes, a slot has room for {room}: "
-                "leave out packages in images/packages/ or files in images/rootfs/exclude.list, or enlarge slot_mib in "
-                "images/boot/card.yml"
-            )
-        with blob.open("rb") as whole:
-            digest = hashlib.file_digest(whole, "sha256").hexdigest()
-        header = {
-            "RELEASE": str(numbers.release),
-            "FLOOR": str(numbers.floor),
-            "BOARD": board.name,
-            "LAYOUT": str(card.LAYOUT.layout),
-            "VERSION": json.loads((root / "contents.json").read_text())["kernel"],
-            "BYTES": str(size),
-            "BLOB": digest,
-            **places,
-            "ARGUMENTS": " ".join(card.kernel_arguments(board)),
-        }
-        (out / "header.json").write_text(json.dumps(header))
-        (out / "header").write_bytes(environment_block.make(header, HEADER_BYTES))
-        (out / "release_keys").unlink()
+    return cache.result("slot", key, lambda out: write(board, root, keys, numbers, out))
 
-    return cache.result("slot", key, make)
+
+def write(board: Board, root: Path, keys: bytes, numbers: Release, out: Path) -> None:
+    """What `build` makes, in `out`."""
+    squashfs, blob = root / "root.squashfs", out / "slot.img"
+    shutil.copyfile(squashfs, blob)
+    parts = {name: root / file for name, file in _NAMES.items() if (root / file).exists()}
+    (out / "release_keys").write_bytes(keys)
+    places = dict.fromkeys(_NAMES, "")
+    with blob.open("r+b") as whole:
+        for name, file in (parts | {"KEYS": out / "release_keys"}).items():
+            start = whole.seek(-(-whole.seek(0, 2) // _ALIGNMENT) * _ALIGNMENT)
+            content = file.read_bytes()
+            whole.write(content)
+            places[name] = f"{start // card.SECTOR}+{-(-len(content) // card.SECTOR)}"
+        whole.truncate(-(-whole.seek(0, 2) // _ALIGNMENT) * _ALIGNMENT)
+    size = blob.stat().st_size
+    room = card.SLOTS[0].size - card.HEADER_ROOM
+    if size > room:
+        raise UserError(
+            f"the root file system of {board.name} and its kernel are {size} bytes, a slot has room for {room}: "
+            "leave out packages in images/packages/ or files in images/rootfs/exclude.list, or enlarge slot_mib in "
+            "images/boot/card.yml"
+        )
+    with blob.open("rb") as whole:
+        digest = hashlib.file_digest(whole, "sha256").hexdigest()
+    header = {
+        "RELEASE": str(numbers.release),
+        "FLOOR": str(numbers.floor),
+        "BOARD": board.name,
+        "LAYOUT": str(card.LAYOUT.layout),
+        "VERSION": json.loads((root / "contents.json").read_text())["kernel"],
+        "BYTES": str(size),
+        "BLOB": digest,
+        **places,
+        "ARGUMENTS": " ".join(card.kernel_arguments(board)),
+    }
+    (out / "header.json").write_text(json.dumps(header))
+    (out / "header").write_bytes(environment_block.make(header, HEADER_BYTES))
+    (out / "release_keys").unlink()

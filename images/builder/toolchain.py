@@ -10,28 +10,30 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flotilla.common import namespace, paths
+from flotilla.fleet.model import Board
 from images.builder import pool, tools
 from images.builder.chroot import Chroot
 from images.builder.lock import read_lock
 
 _ARCHITECTURES = {
     # The kernel's headers are for both, at the place for one.
-    "i386": ["-m32", "-march=pentium3", "-isystem", "/usr/include/x86_64-linux-gnu"],
+    "i386": ["-m32", "-march=i686", "-isystem", "/usr/include/x86_64-linux-gnu"],
     "amd64": ["-m64"],
 }
-"""Options by Debian's name of the architecture. The oldest i386 boards are of the Pentium III class."""
+"""Options by Debian's name of the architecture, for the oldest processor that its packages run on."""
 Run = Callable[[str, Path, Sequence[str], Path], None]
 """Runs a command among the packages of a lock: `run`, or the same elsewhere."""
 _OPTIONS = ["-O2", "-Wl,--build-id=none", "-s"]
 
 
-def compile_static(source: Path, architecture: str, options: Sequence[str] = ()) -> bytes:
+def compile_static(source: Path, board: Board, options: Sequence[str] = ()) -> bytes:
     """A C file as a program that needs nothing of the robot's libraries; errors are the compiler's own words."""
+    processor = [f"-march={board.processor}"] if board.processor else []
     paths.BUILD.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".compile-") as directory:
         work = Path(directory)
         shutil.copy(source, work)
-        argv = ["gcc-12", *_ARCHITECTURES[architecture], *_OPTIONS, "-static", *options]
+        argv = ["gcc-12", *_ARCHITECTURES[board.architecture], *processor, *_OPTIONS, "-static", *options]
         run("toolchain", work, [*argv, "-o", "/out/made", f"/out/{source.name}"], work / "log")
         return (work / "made").read_bytes()
 

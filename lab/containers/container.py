@@ -89,7 +89,7 @@ def boot(
     """Boot the robots. Each then answers SSH at its own address, and this computer has the station's.
 
     `image`: a card image of their board. `log`: a directory for what their first programs say.
-    `booted` is told of each.
+    `booted` is called for each.
     """
     if os.getpid() != 1:
         raise ValueError("robots in containers need a process that the command of `inside` started")
@@ -107,7 +107,7 @@ def boot(
         here = _HERE / robot.name
         _mount("-t", "tmpfs", "-o", f"mode=755,size={DATA_BYTES}", robot.name, here)
         _fill(here, root, fleet, robot)
-        told = _listen(here / "run/notify")
+        notified = _listen(here / "run/notify")
         (ours / robot.name).mkdir()
         argv: list[str | Path] = ["sh", "-c", 'echo 0 >"$0/cgroup.procs" && exec "$@"', ours / robot.name]
         argv += ["setpriv", "--bounding-set", ",".join(f"-{name}" for name in LACKING)]
@@ -116,14 +116,14 @@ def boot(
         argv += [_FIRST_PROGRAM, here, root, station, robot.name]
         with (log / f"{robot.name}.log").open("wb") as output:
             first = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
-        booting.append((robot, told, first))
+        booting.append((robot, notified, first))
     deadline = Deadline(BOOT_SECONDS)
-    for robot, told, first in booting:
-        if not _booted(told, first, deadline):
-            said = (log / f"{robot.name}.log").read_text(errors="replace").strip()
-            raise LabError(f"{robot.name} did not boot within {deadline.seconds:g} s, or ended; it said: {said}")
+    for robot, notified, first in booting:
+        if not _booted(notified, first, deadline):
+            text = (log / f"{robot.name}.log").read_text(errors="replace").strip()
+            raise LabError(f"{robot.name} did not boot within {deadline.seconds:g} s, or ended; its log: {text}")
         booted(robot)
-        told.close()  # a socket that nobody reads would hold up its systemd at some later reload
+        notified.close()  # a socket that nobody reads would hold up its systemd at some later reload
         _run("ip", "link", "set", robot.name, "master", "fleet", "up")
     for robot in robots:
         _wait_for_ssh(robot.address, deadline)
@@ -237,21 +237,21 @@ def own_files(root: Path, board: Board) -> dict[str, str]:
 
 
 def _listen(path: Path) -> socket.socket:
-    """Where a robot's systemd tells that it has booted (sd_notify(3))."""
-    told = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    told.bind(str(path))
-    return told
+    """The socket on which a robot's systemd reports that it has booted (sd_notify(3))."""
+    notified = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    notified.bind(str(path))
+    return notified
 
 
-def _booted(told: socket.socket, first: subprocess.Popen[bytes], deadline: Deadline) -> bool:
+def _booted(notified: socket.socket, first: subprocess.Popen[bytes], deadline: Deadline) -> bool:
     """Wait until the robot has booted; False where it does not, or has ended."""
-    told.settimeout(0.5)
-    said = b""
-    while b"READY=1" not in said.split(b"\n"):
+    notified.settimeout(0.5)
+    message = b""
+    while b"READY=1" not in message.split(b"\n"):
         if deadline.expired or first.poll() is not None:
             return False
         with suppress(TimeoutError):
-            said = told.recv(4096)
+            message = notified.recv(4096)
     return True
 
 

@@ -53,7 +53,7 @@ class Play:
 
     status: int
     wall_s: float
-    said: str
+    output: str
     robots: dict[str, dict[str, Any]]
     """By name, what its report says."""
 
@@ -66,7 +66,7 @@ class Play:
         } | {name: "was not reached" for name in names if name not in self.robots}
         if wrong or self.status:
             listed = "".join(f"\n{name}: {what}" for name, what in wrong.items())
-            raise LabError(f"fleet.yml ended with status {self.status}; not up to date were:{listed or self.said}")
+            raise LabError(f"fleet.yml ended with status {self.status}; not up to date were:{listed or self.output}")
 
 
 @dataclass(frozen=True)
@@ -184,17 +184,26 @@ def far(done: str, count: int) -> progress.Far:
     return progress.Far(booted, count, "robots booted", "boot") if booted < count else progress.Far(part="fleet.yml")
 
 
-def measure(count: int, board: str, image: Path) -> Sample:
-    """One count of robots, in namespaces of its own."""
-    directory = describe(count, board, DIRECTORY / "inventory")
-    argv = [sys.executable, "-m", "lab.containers.scale", str(directory), str(image), str(DIRECTORY / "log")]
+def run_inside(
+    directory: Path, module: str, *arguments: object, timeout: float | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a Python module in namespaces of its own, of which nothing stays.
+
+    `directory`: for its keys and reports; `timeout`: seconds.
+    """
     try:
-        done = subprocess.run(
-            container.inside(argv), env=environment(DIRECTORY), cwd=paths.PROJECT, stdin=subprocess.DEVNULL,
-            capture_output=True, text=True, check=False,
+        return subprocess.run(
+            container.inside([sys.executable, "-m", module, *map(str, arguments)]), env=environment(directory),
+            cwd=paths.PROJECT, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout, check=False,
         )  # fmt: skip
     finally:
         container.clean()
+
+
+def measure(count: int, board: str, image: Path) -> Sample:
+    """One count of robots, in namespaces of its own."""
+    directory = describe(count, board, DIRECTORY / "inventory")
+    done = run_inside(DIRECTORY, "lab.containers.scale", directory, image, DIRECTORY / "log")
     if done.returncode:
         raise UserError(f"{count} robots: {done.stderr.strip()}")
     return Sample(**json.loads(done.stdout))

@@ -104,11 +104,11 @@ def _boot_card(measured: subject.Subject, emulator: machine.Emulator, out: Path)
 
 def timeline(document: dict[str, Any]) -> list[Share]:
     """What a boot went through one after the other, from the start of the kernel's clock."""
-    said = document["commands"]
+    outputs = document["commands"]
     stamps = {
-        name: int(value) / 1e6 for name, value in re.findall(r"^(\w+)TimestampMonotonic=(\d+)$", said["show"], re.M)
+        name: int(value) / 1e6 for name, value in re.findall(r"^(\w+)TimestampMonotonic=(\d+)$", outputs["show"], re.M)
     }
-    kernel_s = next(at for at, text in lines(said["dmesg"]) if text.startswith("Run "))
+    kernel_s = next(at for at, text in lines(outputs["dmesg"]) if text.startswith("Run "))
     marks = [
         ("kernel, until its first program", kernel_s),
         ("preinit: data partition and layers", stamps["Userspace"]),
@@ -122,7 +122,7 @@ def timeline(document: dict[str, Any]) -> list[Share]:
 
 
 def account(boots: Boots) -> str:
-    board, shipped, said = boots.board, boots.card["boot"], boots.memory["commands"]
+    board, shipped, outputs = boots.board, boots.card["boot"], boots.memory["commands"]
     kernel_s = boots.memory["boot"]["userspace_us"] / 1e6
     return "\n".join(
         [
@@ -138,9 +138,9 @@ def account(boots: Boots) -> str:
             "\nuser space, critical path:",
             *[line for line in boots.card["commands"]["chain"].splitlines() if line.strip()],
             "\nfrom memory, kernel, longest initialisation calls:",
-            *_table(initcalls(said["dmesg"])),
+            *_table(initcalls(outputs["dmesg"])),
             "\nfrom memory, kernel, longest times between two messages, by the later one:",
-            *_table(silences([line for line in lines(said["dmesg"]) if line[0] <= kernel_s])),
+            *_table(silences([line for line in lines(outputs["dmesg"]) if line[0] <= kernel_s])),
         ]
     )
 

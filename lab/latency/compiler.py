@@ -14,4 +14,4 @@ def programs(board: Board) -> dict[str, bytes]:
     """All of them by name, by the locked compiler, so that every development computer measures the same."""
     here = Path(__file__).parent
     options = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-pthread"]
-    return {Path(name).stem: toolchain.compile_static(here / name, board.architecture, options) for name in SOURCES}
+    return {Path(name).stem: toolchain.compile_static(here / name, board, options) for name in SOURCES}

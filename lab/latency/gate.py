@@ -85,9 +85,9 @@ def check(found: Results, file: Path) -> str:
     if found.plan == "disk":
         return _check_bounds(found)
     baseline = accepted(file)
-    if said := refusal(found, baseline):
+    if refused := refusal(found, baseline):
         raise UserError(
-            f"latency is not that of {paths.shown(file)}:\n  {said}\n"
+            f"latency is not that of {paths.shown(file)}:\n  {refused}\n"
             f"`make latency` shows the distributions; if this is meant: {ACCEPT}"
         )
     differing = causes(found, baseline)
@@ -103,8 +103,8 @@ def check_control(found: Results) -> str:
     baseline = accepted(baseline_of_control(found))
     later = [name for name in found.scenarios if _latest_us(found, name) > TIMES * _latest_us(baseline, name)]
     if later:
-        said = refusal(found, baseline)
-        return f"{found.board}, {found.kernel}: refused, as it has to be, for {', '.join(later)}:\n  {said}"
+        refused = refusal(found, baseline)
+        return f"{found.board}, {found.kernel}: refused, as it has to be, for {', '.join(later)}:\n  {refused}"
     raise UserError(
         f"{found.board}, {found.kernel}: the negative control passes: no wake-up is more than {TIMES} times as late as "
         "that of the accepted run, so the measurement notices nothing"

@@ -26,14 +26,14 @@ def cause(lines: Sequence[str]) -> str:
     if functions:  # gathered by the timer's interrupt, which takes longer by it
         late_ns -= sum(int(match["ns"]) for match in noises if match["name"] == _TIMER)
         noises = [match for match in noises if match["name"] != _TIMER]
-    said = [f"{late_ns // 1000} µs late"]
+    facts = [f"{late_ns // 1000} µs late"]
     entries = [at for at, name in enumerate(functions) if _ENTRY.search(name)]
     running = functions[entries[-1] + 1 :] if entries else functions
     interrupted = [match["task"].strip() for match in samples if match["kind"] == "irq"]
     if interrupted:
         where = f" in {' < '.join(running[:_SHOWN])}" if running else ""
-        said.append(f"the timer found {interrupted[-1]}{where}")
+        facts.append(f"the timer found {interrupted[-1]}{where}")
     if noises:
         longest = max(noises, key=lambda match: int(match["ns"]))
-        said.append(f"longest before the thread: {longest['kind']} {longest['name']}, {int(longest['ns']) // 1000} µs")
-    return "; ".join(said)
+        facts.append(f"longest before the thread: {longest['kind']} {longest['name']}, {int(longest['ns']) // 1000} µs")
+    return "; ".join(facts)

@@ -88,6 +88,38 @@ with Epos2Server(SocketCanBus("can1"), drive).running():
 sys.exit(status)
 """
 
+SIGNALS = 8
+WATCHED = "\n".join(
+    [
+        "period: 1 ms",
+        "priority: 80",
+        "blocks:",
+        "  b0: {type: integrator, in: {in: 1}}",
+        *(
+            f"  b{i}: {{type: gain, in: {{in: b{i - 1}.out}}, parameters: {{factor: 1.001}}}}"
+            for i in range(1, SIGNALS)
+        ),
+        "",
+    ]
+)
+CLIENTS = 4
+"""As many as may watch a task."""
+WATCH_ROWS = 1000
+_NAMES = " ".join(f"b{i}.out" for i in range(SIGNALS))
+# The clients come one after the other while the task runs, and are gone before it ends.
+WATCHING = f"""
+{{run}} --control /run/watched.control & task=$!
+until [ -S /run/watched.control ]; do sleep 0.01; done
+clients=
+for client in $(seq {CLIENTS}); do
+  flotilla-scope --control /run/watched.control --rows {WATCH_ROWS} watched {_NAMES} >/run/watched.$client &
+  clients="$clients $!"
+done
+for client in $clients; do wait $client || exit 1; done
+wait $task || exit 1
+cat /run/watched.json
+"""
+
 RUN = "flotilla-run --blocks {directory} --steps {steps} --statistics /run/{name}.json {directory}/{name}.yml"
 
 
@@ -107,18 +139,25 @@ def run(board: Board, out: Path) -> dict[str, str]:
     fast = RUN.format(name="fast", steps=SECONDS * 100, directory=DIRECTORY)
     slow = RUN.format(name="slow", steps=SECONDS * 10, directory=DIRECTORY)
     velocity = RUN.format(name="velocity", steps=SECONDS * 100, directory=DIRECTORY).split()
+    alone = RUN.format(name="alone", steps=SECONDS * 1000, directory=DIRECTORY)
+    watched = RUN.format(name="watched", steps=SECONDS * 1000, directory=DIRECTORY)
     commands = {  # which run in the order of their names
         "chain": ["sh", "-c", f"{chain} && cat /run/latencies.json"],
         "drive": ["python3", f"{DIRECTORY}/drive.py", *velocity, *WATCH],
         "both": ["sh", "-c", f"{{ {fast}; echo fast: $?; }} 2>&1 & {{ {slow}; echo slow: $?; }} 2>&1; wait"],
         "fast": ["cat", "/run/fast.json"],
         "slow": ["cat", "/run/slow.json"],
+        "task_alone": ["sh", "-c", f"{alone} && cat /run/alone.json"],
+        "task_watched": ["sh", "-c", WATCHING.format(run=watched)],
+        "watched_rows": ["sh", "-c", "cat /run/watched.[0-9]"],
     }
     files = {
         "chain.yml": CHAIN.format(device=device).encode(),
         "fast.yml": FAST.encode(),
         "slow.yml": SLOW.encode(),
         "velocity.yml": VELOCITY.encode(),
+        "alone.yml": WATCHED.encode(),
+        "watched.yml": WATCHED.encode(),
         "drive.py": DRIVE.encode(),
         "loopback.so": runtime.compile_plugin(PLUGIN, board.architecture),
     }
@@ -133,13 +172,13 @@ def run(board: Board, out: Path) -> dict[str, str]:
     guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=CAN_BOARDS)
     document = results.received(guest.run(out, 600))
     initrd.unlink()
-    said: dict[str, str] = document["commands"]
-    return said
+    outputs: dict[str, str] = document["commands"]
+    return outputs
 
 
-def chain(said: dict[str, str]) -> Latency:
+def chain(outputs: dict[str, str]) -> Latency:
     """From the first byte's write to the port, through line, driver, controller and relay board's I/O port."""
-    return _latency(json.loads(said["chain"])["histogram_us"])
+    return _latency(json.loads(outputs["chain"])["histogram_us"])
 
 
 def check(found: Latency, file: Path = BASELINE) -> None:

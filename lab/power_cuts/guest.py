@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,17 +20,17 @@ from images.builder import bundle, card, environment_block, slot
 from images.builder.tools import Tools, command
 from lab.power_cuts import releases
 from lab.power_cuts.crash_states import CrashState
-from lab.power_cuts.layout_2 import TRIES, Layout2, header_sectors
+from lab.power_cuts.layout_2 import TRIES, Layout2, frame, header_sectors
 from lab.power_cuts.replay import Recording
 from lab.power_cuts.timeline import UNREADABLE, Timeline
-from lab.power_cuts.write_log import SECTOR, count_entries
+from lab.power_cuts.write_log import SECTOR, WriteLog, count_entries
 from lab.qemu import qemu
 from lab.qemu.guest import Guest
 from lab.qemu.ssh import Ssh
 from lab.qemu.timing import LabError
 
 _UPDATE = "/usr/lib/flotilla/update.py"
-_INPUT, _TAIL = "/tmp/input", "/tmp/tail"
+_INPUT = "/tmp/input"
 _SECONDS = 1200
 """Limit for what takes a minute on an idle host."""
 
@@ -99,27 +98,18 @@ class Updated:
         new = successor(old)
         manifest = _manifest(new, directory)
         self._start()
-        self._told("begin", manifest)
-        self._shell.write(_TAIL, new.content[len(old.content) :])
-        # What is the same in both, the robot has: a delta's decoder would write as much.
-        whole = f"{{ head -c {len(old.content)} /dev/sda2; cat {_TAIL}; }} | {_UPDATE} blob"
-        half = len(old.content) // 2 // SECTOR
-        # Sectors written: those of a partition miss what goes to the whole disk.
-        seventh = "read -r _ _ _ _ _ _ n _ </sys/block/sda/stat"
-        self._shell.script(
-            f"{seventh}; before=$n; systemd-run --quiet sh -c {shlex.quote(whole)}; "
-            f"until {seventh} && [ $((n - before)) -gt {half} ]; do sleep 0.1; done",
-            timeout=_SECONDS,
-        )
+        self._answer("begin", manifest)
+        self._copy_until(len(old.content) // 2)
         self._machine.cut()
         self._start()
-        self._told("begin", manifest)
-        self._shell.write(_TAIL, new.content[len(old.content) :])
-        self._shell.script(whole, timeout=_SECONDS)
-        if not self._told("finish")["staged"]:
+        self._answer("begin", manifest)
+        missing = self._answer("copy")["missing"]
+        chunks = [(number, new.content[number * bundle.CHUNK_BYTES :][: bundle.CHUNK_BYTES]) for number in missing]
+        self._answer("write", b"".join(frame(*chunk) for chunk in chunks))
+        if not self._answer("finish")["staged"]:
             raise LabError("update.py did not stage the release")
         self._may_start("old", "new")
-        self._told("activate")
+        self._answer("activate")
         self._restart()
         self._shell.script("flotilla-slot confirm", timeout=_SECONDS)
         self._may_start("new")
@@ -127,11 +117,23 @@ class Updated:
         self._machine.cut()
         return self._recording(old, new, directory)
 
-    def _told(self, what: str, content: bytes = b"") -> dict[str, Any]:
-        """What update.py says to a command with this input."""
+    def _answer(self, what: str, content: bytes = b"") -> dict[str, Any]:
+        """What update.py answers to a command with this input."""
         self._shell.write(_INPUT, content)
-        said: dict[str, Any] = json.loads(self._shell.script(f"{_UPDATE} {what} <{_INPUT}", timeout=_SECONDS).stdout)
-        return said
+        output = self._shell.script(f"{_UPDATE} {what} <{_INPUT}", timeout=_SECONDS).stdout
+        answer: dict[str, Any] = json.loads(output)
+        return answer
+
+    def _copy_until(self, size: int) -> None:
+        """Let update.py copy what both releases have, until so many bytes are written."""
+        # Sectors written: those of a partition miss what goes to the whole disk.
+        seventh = "read -r _ _ _ _ _ _ n _ </sys/block/sda/stat"
+        self._shell.script(
+            f"{seventh}; before=$n; systemd-run --quiet --unit=copied {_UPDATE} copy; "
+            f"until {seventh} && [ $((n - before)) -gt {size // SECTOR} ]; "
+            "do systemctl is-active --quiet copied || exit 1; sleep 0.1; done",
+            timeout=_SECONDS,
+        )
 
     def _may_start(self, *names: str) -> None:
         self._phases.append((count_entries(self._log), frozenset(names)))
@@ -176,13 +178,26 @@ def card_of(timeline: Timeline, state: CrashState, base: Path, out: Path) -> Pat
     return out
 
 
-def check_data(
-    tools: Tools, timeline: Timeline, states: Iterable[CrashState], base: Path, directory: Path
-) -> list[str]:
-    """Of these states, those whose data partition cannot be made good from its journal alone, and what e2fsck says.
+def states_of_data(log: WriteLog, states: Iterable[CrashState]) -> list[CrashState]:
+    """Of these states, those in which writes of the data partition are lost, torn or the last that came."""
+    first = card.DATA.start // SECTOR
 
-    Linux mounts the partition after replaying the journal, as e2fsck does by the same rules; what remains then is what
-    it finds without a question. A boot for each state would show no more: it reads files of a sound file system.
+    def is_data(index: int) -> bool:
+        return index >= 0 and log.entries[index].count > 0 and log.entries[index].sector >= first
+
+    return [
+        state
+        for state in states
+        if is_data(state.upto if state.torn else state.upto - 1) or any(is_data(each) for each in state.lost)
+    ]
+
+
+def faults_of_data(
+    tools: Tools, timeline: Timeline, states: Iterable[CrashState], base: Path, directory: Path
+) -> Iterator[str]:
+    """Of these states, those whose data partition is not sound once its journal is replayed, and what e2fsck finds.
+
+    Linux replays the journal when it mounts the partition, by the same rules, and checks nothing.
     """
     directory.mkdir(parents=True, exist_ok=True)
     first = card.DATA.start // SECTOR
@@ -190,7 +205,6 @@ def check_data(
     count = -(-(base.stat().st_size - card.DATA.start) // (1 << 20))
     copy = ["dd", f"if={base}", f"of={plain}", "bs=1M", f"skip={card.DATA.start >> 20}", f"count={count}"]
     subprocess.run([*copy, "conv=sparse", "status=none"], check=True)
-    faults = []
     for state in states:
         subprocess.run(["cp", "--sparse=always", str(plain), str(tried)], check=True)
         with tried.open("r+b") as file:
@@ -198,11 +212,13 @@ def check_data(
                 if sector >= first and number != UNREADABLE:
                     file.seek((sector - first) * SECTOR)
                     file.write(timeline.content(number))
-        argv = [*command(tools.directory, "usr/sbin/e2fsck"), "-f", "-p", str(tried)]
-        done = subprocess.run(argv, capture_output=True, text=True, check=False)
-        if done.returncode not in (0, 1):
-            faults.append(f"{state}: e2fsck ended with {done.returncode}: {done.stdout.strip()} {done.stderr.strip()}")
-    return faults
+        for options in (["-E", "journal_only", "-p"], ["-f", "-n"]):
+            argv = [*command(tools.directory, "usr/sbin/e2fsck"), *options, str(tried)]
+            done = subprocess.run(argv, capture_output=True, text=True, check=False)
+            if done.returncode:
+                what = f"e2fsck {' '.join(options)} ended with {done.returncode}"
+                yield f"{state}: {what}: {done.stdout.strip()} {done.stderr.strip()}"
+                break
 
 
 def _manifest(release: Held, directory: Path) -> bytes:

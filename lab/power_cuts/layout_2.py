@@ -60,6 +60,11 @@ def sectors(start: int, size: int) -> range:
     return range(start // SECTOR, -(-(start + size) // SECTOR))
 
 
+def frame(number: int, content: bytes) -> bytes:
+    """A chunk as update.py's `write` reads it."""
+    return struct.pack("<II", number, len(content)) + content
+
+
 def header_sectors(partition: card.Partition) -> range:
     return sectors(partition.end - card.HEADER_ROOM, slot.HEADER_BYTES)
 
@@ -175,13 +180,12 @@ class Robot:
         (self._directory / brought.name / "header.json").write_text(json.dumps(brought.header))
         manifest = bundle.manifest_of(self._directory / brought.name).decode()
         with self._mounted() as file:
-            said = self._update(file, "begin", json.dumps({"manifest": manifest, "signatures": []}).encode())
-            size = int(said["chunk_bytes"])
-            chunks = [(number, brought.content[number * size :][:size]) for number in said["missing"][:upto]]
+            answer = self._update(file, "begin", json.dumps({"manifest": manifest, "signatures": []}).encode())
+            size = int(answer["chunk_bytes"])
+            chunks = [(number, brought.content[number * size :][:size]) for number in answer["missing"][:upto]]
             for start in range(0, len(chunks), _BATCH):
                 batch = chunks[start : start + _BATCH]
-                frames = [struct.pack("<II", number, len(content)) + content for number, content in batch]
-                self._update(file, "write", b"".join(frames))
+                self._update(file, "write", b"".join(frame(*chunk) for chunk in batch))
             if upto is None and not self._update(file, "finish")["staged"]:
                 raise LabError(f"update.py did not stage {brought.name}")
 
@@ -214,10 +218,10 @@ class Robot:
             str(self._directory / "known"),
             command,
         ]
-        said: dict[str, Any] = json.loads(
+        answer: dict[str, Any] = json.loads(
             self._ran(argv, content, {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"})
         )
-        return said
+        return answer
 
     def _ran(self, argv: Sequence[str], content: bytes = b"", environment: Mapping[str, str] | None = None) -> str:
         done = subprocess.run(argv, input=content, capture_output=True, env=environment, check=False)
@@ -237,7 +241,7 @@ class Robot:
         node = qemu.logged({"driver": "file", "filename": str(self._card), "cache": {"no-flush": True}}, self.log)
         errors = self._directory / "storage-daemon.stderr"
         ours, theirs = socket.socketpair()
-        with ours, errors.open("wb") as said:
+        with ours, errors.open("wb") as stderr:
             with theirs:
                 argv = [
                     *DIE_WITH_PARENT, qemu.find_tool("qemu-storage-daemon"),
@@ -246,7 +250,7 @@ class Robot:
                     "--chardev", qemu.chardev("qmp", qemu.inherited_socket(theirs.fileno())),
                     "--monitor", "chardev=qmp",
                 ]  # fmt: skip
-                daemon = subprocess.Popen(argv, stderr=said, pass_fds=[theirs.fileno()])
+                daemon = subprocess.Popen(argv, stderr=stderr, pass_fds=[theirs.fileno()])
             try:
                 if not ours.recv(4096):  # its greeting comes when all is set up
                     raise LabError(f"qemu-storage-daemon ended: {errors.read_text().strip()}")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import random
 import struct
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+
+from lab.qemu.stub_computer import assemble_stub
 
 _PROGRAM = 0x400
 _SYSSIZE = 0x1F4
@@ -31,7 +32,7 @@ class Release:
 def make(name: str, directory: Path, *, root: int, kernel: int, initramfs: int) -> Release:
     """A release of parts with these numbers of bytes, each a multiple of 512; the same name makes the same bytes."""
     chance = random.Random(name)
-    stub = _named(_assembled(directory), name, kernel)
+    stub = _named(assemble_stub(directory, release=True), name, kernel)
     body = stub[_PROGRAM:] + chance.randbytes(kernel - len(stub))
     return Release(
         name, chance.randbytes(root), stub[:_PROGRAM] + _balanced(body), _balanced(chance.randbytes(initramfs))
@@ -55,23 +56,12 @@ def _balanced(content: bytes) -> bytes:
     return content[:-4] + struct.pack("<I", -(_START + sum(words[:-1])) & 0xFFFFFFFF)
 
 
-def _assembled(directory: Path) -> bytes:
-    kernel, linked = directory / "release_stub", directory / "release_stub.o"
-    source = Path(__file__).with_name("release_stub.S")
-    for argv in (
-        ["as", "--32", "-o", str(linked), str(source)],
-        ["objcopy", "-O", "binary", "-j", ".text", str(linked), str(kernel)],
-    ):
-        subprocess.run(argv, check=True, capture_output=True, text=True)
-    return kernel.read_bytes()
-
-
 def stand_in(name: str, directory: Path, kernel: bytes, initramfs: bytes = b"") -> dict[tuple[int, int], bytes]:
     """What makes a real kernel say its release, as a small one does: by part (0: kernel) and sector, the new content.
 
     The rest stays, and is added up, so a part of which anything is missing is TORN.
     """
-    stub = _named(_assembled(directory), name, len(kernel))
+    stub = _named(assemble_stub(directory, release=True), name, len(kernel))
     parts = [stub[:_PROGRAM] + _balanced(stub[_PROGRAM:] + kernel[len(stub) :])]
     parts += [_balanced(initramfs)] if initramfs else []
     changed = {}

@@ -1,30 +1,21 @@
 """A computer in QEMU that is reset for each state of its card, and says which release its boot loader started.
 
-Boot loader and card are real, the kernels are those of `releases.py`: a second for each start. Time is virtual, so
-waiting takes none, and a slow host makes no difference.
+Boot loader and card are real, the kernels are those of `releases.py`.
 """
 
 from __future__ import annotations
 
-import json
 import re
-import socket
 import subprocess
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from flotilla.fleet.model import Board
 from lab.power_cuts.write_log import SECTOR
-from lab.qemu import qemu
-from lab.qemu.console import SerialConsole
-from lab.qemu.process import Emulator
+from lab.qemu.stub_computer import GAVE_UP, START_SECONDS, StubComputer, slot_of
 
-START_SECONDS = 120
-"""Limit for what takes one second on an idle host."""
 _STARTED = r"stub kernel: release (\S+) (whole|TORN) (whole|TORN) (.*?)\r?\nstub kernel ends"
-_GAVE_UP = r"no slot can be loaded|slot .* does not boot|grub rescue>|grub>"
 _BIOS_GAVE_UP = r"No bootable device|Boot failed"
 
 Content = Mapping[int, bytes]
@@ -43,8 +34,8 @@ class Started:
     """The kernel and its initramfs were loaded whole."""
 
 
-class Starter:
-    """Use it as a context manager."""
+class Starter(StubComputer):
+    """Reset for each state."""
 
     def __init__(
         self,
@@ -67,44 +58,10 @@ class Starter:
             self._disk.unlink(missing_ok=True)
             self._disk.hardlink_to(base)
         self._planted: Content = {}
-        file: dict[str, object] = {"driver": "file", "filename": str(self._disk)}
-        if rules := [
-            {"event": "none", "iotype": "read", "sector": sector, "errno": 5} for sector in sorted(unreadable)
-        ]:
-            file = {"driver": "blkdebug", "image": file, "inject-error": rules}
-        blockdev: dict[str, object] = {"driver": "raw", "cache": {"no-flush": True}, "file": file}
-        if log_writes is not None:
-            blockdev = qemu.logged(blockdev, log_writes)
-        blockdev |= {"node-name": "card"}
-        ours, theirs = socket.socketpair()
-        self.console = SerialConsole(directory / "console.log", lambda: self._emulator.explain())
         self.reads = directory / "reads.log"
         """QEMU's trace of what the computer read of the card."""
-        options = qemu.Options(
-            console=qemu.inherited_socket(theirs.fileno()),
-            paused=True,
-            virtual_time=True,
-            extra=("-trace", f"enable=blk_co_preadv,file={self.reads}"),
-        )
-
-        def argv(qmp: str) -> list[str]:
-            words = qemu.command_line(board, self._disk, options)
-            words[words.index("-blockdev") + 1] = json.dumps(blockdev)
-            return [*words, "-chardev", qemu.chardev("qmp", qmp), "-mon", "chardev=qmp,mode=control"]
-
-        with theirs:
-            self._emulator = Emulator(argv, directory, inherited=[theirs.fileno()])
-        self.console.attach(ours)
-
-    def __enter__(self) -> Starter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._emulator.kill()
-        self.console.close()
-        self._disk.unlink()
+        trace = ("-trace", f"enable=blk_co_preadv,file={self.reads}")
+        super().__init__(board, self._disk, directory, unreadable=unreadable, log_writes=log_writes, extra=trace)
 
     def plant(self, content: Content, own: Iterable[int]) -> None:
         """Make the card the base with this content, while the computer stands still.
@@ -127,12 +84,10 @@ class Starter:
 
     def power_on(self) -> Started:
         """Start the computer with its card as it is, and wait for what comes of it."""
-        self._emulator.execute("system_reset")
-        self._emulator.execute("cont")
-        found = self.console.expect(f"{_STARTED}|{_GAVE_UP}|{_BIOS_GAVE_UP}", START_SECONDS)
-        self._emulator.execute("stop")  # one that gave up would start again and again
-        slot = re.search(r"flotilla\.slot=(\w+)", found[4] or "")
-        return Started(slot and slot[1], found[1], found[2] == found[3] == "whole")
+        self.reset()
+        found = self.console.expect(f"{_STARTED}|{GAVE_UP}|{_BIOS_GAVE_UP}", START_SECONDS)
+        self.stop()  # one that gave up would start again and again
+        return Started(slot_of(found[4]), found[1], found[2] == found[3] == "whole")
 
     def sectors_read(self) -> set[int]:
         """All sectors of the card that the computer has read since it was made."""

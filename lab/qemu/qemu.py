@@ -9,11 +9,12 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
@@ -21,6 +22,8 @@ from flotilla.fleet.model import Board, Network
 
 CARD_BYTES = 1_000_000_000
 """What a card sold as 1 GB holds at least; larger than the images, so that the first boot grows the data partition."""
+
+_VIRTUAL_START = datetime(2026, 1, 1)
 
 # Chardev backends: the text after `-chardev` without the id.
 NULL = "null"
@@ -109,7 +112,7 @@ def command_line(board: Board, card: Path, options: Options) -> list[str]:
     if options.virtual_time:
         # One thread, fixed seed and clock: tried to repeat to the byte, see the facts on testing networks.
         argv += ["-accel", "tcg,thread=single", "-icount", "shift=3,sleep=off", "-machine", "hpet=off,usb=off"]
-        argv += ["-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"]
+        argv += ["-rtc", f"base={_VIRTUAL_START.isoformat()},clock=vm", "-seed", "1"]
     else:
         argv += ["-accel", "tcg", "-rtc", "base=utc"]
     argv += ["-action", f"watchdog={options.watchdog}"]
@@ -134,6 +137,14 @@ def command_line(board: Board, card: Path, options: Options) -> list[str]:
     if options.monitor:
         argv += ["-mon", "chardev=console,mode=readline"]
     return [*argv, *options.extra]
+
+
+def virtual_s(execute: Callable[..., Any]) -> float:
+    """Seconds of virtual time since power on, by the machine's battery clock. `execute`: its QMP commands."""
+    now = execute("qom-get", path="/machine", property="rtc-time")
+    day = datetime(now["tm_year"] + 1900, now["tm_mon"] + 1, now["tm_mday"])
+    since = day + timedelta(hours=now["tm_hour"], minutes=now["tm_min"], seconds=now["tm_sec"])
+    return (since - _VIRTUAL_START).total_seconds()
 
 
 def program(board: Board) -> str:

@@ -33,7 +33,7 @@ class Segment:
         """
         directory.mkdir(parents=True, exist_ok=True)
         robots = list(robots)
-        ports = iter(_free_udp_ports(2 * len(robots) + len(datagrams)))
+        ports = iter(free_udp_ports(2 * len(robots) + len(datagrams)))
         self._links = {robot: qemu.Wire(next(ports), next(ports)) for robot in robots}
         self._udp = dict(zip(datagrams, ports, strict=True))
         user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0), self._udp)
@@ -80,7 +80,7 @@ def station_address(fleet: Fleet) -> IPv4Address:
     return qemu.station_address(fleet.network, *(robot.address for robot in fleet.robots.values()))
 
 
-def _free_udp_ports(count: int) -> list[int]:
+def free_udp_ports(count: int) -> list[int]:
     """Ports that nobody has; parallel test workers get others."""
     with ExitStack() as held:  # all at once, or the same one would be found again
         probes = [held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]

@@ -30,9 +30,13 @@ HOPELESS = ("Permission denied", "Host key verification failed", "REMOTE HOST ID
 class Ssh:
     """Commands on a robot. Connects when first used, and again after the robot was away."""
 
-    def __init__(self, robot: Robot, host: str, port: Callable[[], int] = lambda: 22) -> None:
-        """`port` is asked at each connection, because a guest's changes when it is powered on again."""
+    def __init__(
+        self, robot: Robot, host: str, port: Callable[[], int] = lambda: 22, within: Sequence[str] = ()
+    ) -> None:
+        """`port` is asked at each connection, because a guest's changes when it is powered on again. `within`: what
+        goes before a command that is to run on the station's computer, where that is not this one."""
         self._robot = robot
+        self._within = within
         self._scratch = tempfile.TemporaryDirectory(prefix="lab-")  # sockets' paths must be short
         self._options = ["-F", "none", *ssh_options(robot), "-o", f"ControlPath={self._scratch.name}/master"]
         self._host = host
@@ -50,13 +54,13 @@ class Ssh:
         """Wait until the robot lets us in; a refused key or host key is reported at once."""
         deadline = Deadline(timeout)
         while not deadline.expired:
-            said = self._try_to_connect(deadline)
-            if said is None:
+            reason = self._try_to_connect(deadline)
+            if reason is None:
                 return
-            if any(phrase in said for phrase in HOPELESS):
-                raise LabError(f"{self._robot.name}: SSH refused: {said}")
+            if any(phrase in reason for phrase in HOPELESS):
+                raise LabError(f"{self._robot.name}: SSH refused: {reason}")
             time.sleep(RETRY_SECONDS)  # nothing tells from outside when a robot starts to listen
-        raise Expired(f"{self._robot.name}: no SSH within {timeout:g} s: {said}")
+        raise Expired(f"{self._robot.name}: no SSH within {timeout:g} s: {reason}")
 
     def run(
         self, argv: Sequence[str], *, timeout: float = 60, check: bool = True, stdin: str = ""
@@ -83,30 +87,30 @@ class Ssh:
         one = f"{{ errors=$(sh -c {shlex.quote(text)} 2>&1 >&3 3>&- </dev/null); }} 3>&1"
         self._root.stdin.write(f"{one}; printf '\\n%s %d\\n%s\\n%s\\n' {mark} $? \"$errors\" {mark}\n")
         self._root.stdin.flush()
-        said = self._said_by_root(f"\n{mark}\n", text, deadline)
-        output, _, rest = said.partition(f"\n{mark} ")
+        answer = self._output_of_root(f"\n{mark}\n", text, deadline)
+        output, _, rest = answer.partition(f"\n{mark} ")
         status, _, errors = rest.partition("\n")
         result = subprocess.CompletedProcess(["sh", "-c", text], int(status), output, errors)
         if check and result.returncode:
             raise LabError(f"{self._robot.name}: {text}: status {status}\n{output}{errors}")
         return result
 
-    def _said_by_root(self, end: str, text: str, deadline: Deadline) -> str:
-        """What the shell of root says, up to its end."""
+    def _output_of_root(self, end: str, text: str, deadline: Deadline) -> str:
+        """Output of root's shell, up to `end`."""
         assert self._root
         assert self._root.stdout
-        said = b""
+        output = b""
         with selectors.DefaultSelector() as selector:
             selector.register(self._root.stdout, selectors.EVENT_READ)
-            while not said.endswith(end.encode()):
+            while not output.endswith(end.encode()):
                 ready = selector.select(deadline.left)
                 more = os.read(self._root.stdout.fileno(), 1 << 16) if ready else b""
                 if not more:
                     self._leave_root()
                     why = "the connection ended" if ready else f"no end within {deadline.seconds:g} s"
-                    raise (LabError if ready else Expired)(f"{self._robot.name}: {text}: {why}\n{_text(said)}")
-                said += more
-        return _text(said).removesuffix(end)
+                    raise (LabError if ready else Expired)(f"{self._robot.name}: {text}: {why}\n{_text(output)}")
+                output += more
+        return _text(output).removesuffix(end)
 
     def _leave_root(self) -> None:
         if self._root:
@@ -151,7 +155,7 @@ class Ssh:
             raise Expired(f"{self._robot.name}: {shlex.join(argv)}: no end within {timeout:g} s\n{so_far}") from None
 
     def _command(self, argv: Sequence[str]) -> list[str]:
-        return ["ssh", *self._options, self._host, shlex.join(argv)]
+        return [*self._within, "ssh", *self._options, self._host, shlex.join(argv)]
 
     def _try_to_connect(self, deadline: Deadline) -> str | None:
         """Start the shared connection: None when it stands, else what ssh said."""
@@ -159,7 +163,7 @@ class Ssh:
         # `LocalCommand` runs once the connection stands, so its output is the event to wait for.
         ready = ["-o", "PermitLocalCommand=yes", "-o", "LocalCommand=echo ready"]
         alive = ["-o", "ConnectTimeout=20", "-o", "ServerAliveInterval=10", "-o", "ServerAliveCountMax=6"]
-        argv = [*DIE_WITH_PARENT, "ssh", "-M", "-N", *ready, *alive, *self._options]
+        argv = [*self._within, *DIE_WITH_PARENT, "ssh", "-M", "-N", *ready, *alive, *self._options]
         argv += ["-p", str(self._port()), self._host]
         self._master = subprocess.Popen(
             argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -66,15 +66,23 @@ def guests_inventory(ports: Mapping[str, int]) -> str:
 
 
 @contextmanager
-def running(fleet: Fleet, robots: Sequence[Robot], directory: Path) -> Iterator[tuple[dict[str, Guest], Segment]]:
-    """The robots as guests on one segment with the station, switched on, by name; not yet booted."""
+def running(
+    fleet: Fleet, robots: Sequence[Robot], directory: Path, ports: Mapping[str, Mapping[str, str]] | None = None
+) -> Iterator[tuple[dict[str, Guest], Segment]]:
+    """The robots as guests on one segment with the station, switched on, by name; not yet booted.
+
+    `ports`: by the robot's name, its `qemu.Options.ports`.
+    """
     with ExitStack() as stack:
         addresses = [robot.address for robot in robots]
         segment = Segment(fleet.network, addresses, station_address(fleet), directory / "segment")
         stack.enter_context(segment)
         guests = {}
         for robot in robots:
-            options = qemu.Options(name=robot.name, mac=qemu.robot_mac(robot.number), link=segment.link(robot.address))
+            options = qemu.Options(
+                name=robot.name, mac=qemu.robot_mac(robot.number), link=segment.link(robot.address),
+                ports=(ports or {}).get(robot.name, {}),
+            )  # fmt: skip
             guest = Guest(fleet.boards[robot.board], image_of(robot), directory / robot.name, options)
             guests[robot.name] = stack.enter_context(guest)
             guest.on()
@@ -147,15 +155,15 @@ def status() -> str:
 def down() -> str:
     """End the virtual fleet, be it still starting, and remove what it left."""
     ended = "no virtual fleet runs"
-    told = False
+    signalled = False
     deadline = time.monotonic() + DOWN_SECONDS
     while (lock := _free_lock()) is None:
-        if not told and (holder := _LOCK.read_text()):
+        if not signalled and (holder := _LOCK.read_text()):
             ports = _written_ports()
             ended = f"{len(ports)} guests ended" if ports else "the virtual fleet ended before it had started"
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(int(holder), signal.SIGTERM)
-            told = True
+            signalled = True
         if time.monotonic() > deadline:
             raise UserError(
                 f"the virtual fleet did not end within {DOWN_SECONDS} s; process {_LOCK.read_text()} holds it"

@@ -56,8 +56,8 @@ class Flight:
     """What tasks wrote at their end, by name; empty where they were not asked to."""
     events_ns: list[int] = field(default_factory=list)
     """When the events of the plan had happened."""
-    heard_too: list[Record] = field(default_factory=list)
-    """What a second station heard of the steps; empty where there was none."""
+    second_station: list[Record] = field(default_factory=list)
+    """What a second station received of the steps; empty where there was none."""
     one_clock: bool = True
     """Whether stamps of different computers may be compared, as in virtual time."""
 

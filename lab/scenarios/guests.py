@@ -148,8 +148,8 @@ class GuestFleet:
             if deadline.expired:
                 commands = self._records.get("valves", [])
                 good = sum(record["good"] for record in commands)
-                said = "; ".join([f"{good} of {len(commands)} commands good", *self._receiver.summary])
-                raise Expired(f"not within {seconds:g} s: {said}. A busy computer is too slow for guests in real time")
+                state = "; ".join([f"{good} of {len(commands)} commands good", *self._receiver.summary])
+                raise Expired(f"not within {seconds:g} s: {state}. A busy computer is too slow for guests in real time")
             select.select(self._sockets, [], [], min(deadline.left, 0.1))
             self._hear()
 
@@ -225,11 +225,11 @@ def guest_fleet(plan: Plan, out: Path, board: Board | None = None) -> Iterator[G
     with ExitStack() as stack:
         stack.enter_context(mock.patch.object(paths, "KEYS", out / "keys"))
         build.build(described, robots, out / "images")
-        heard_at = (flying.address, IGPS_PORT)
+        receiver = (flying.address, IGPS_PORT)
         segment = stack.enter_context(
             Segment(
                 described.network, [one.address for one in robots], described.stations[0].address, out / "segment",
-                [heard_at],
+                [receiver],
             )
         )  # fmt: skip
         relays = stack.enter_context(RelayPorts(robot.board))
@@ -246,7 +246,7 @@ def guest_fleet(plan: Plan, out: Path, board: Board | None = None) -> Iterator[G
             shells[one.name] = stack.enter_context(Ssh(one, LOOPBACK, port))
         machines[flying.name].prepare()
         stack.enter_context(SerialLine(Dsp3000(robot.gyro_deg_s, noise=0), UnixSocket(str(gyro))))
-        there = (LOOPBACK, segment.udp_port(*heard_at))
+        there = (LOOPBACK, segment.udp_port(*receiver))
         igps = stack.enter_context(Igps(there, robot.position, rate=100, faults=Faults(loss=1)))
         lab = GuestFleet(described, robot, igps, machines, shells)
         stack.callback(lab.close)

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jinja2
-import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
+from flotilla.station import figures
+from flotilla.station.figures import BLUE, GREY, RED
 from lab.scenarios.crowd import Crowd
 from lab.scenarios.flight import HOPS, LIMIT_US, Flight
 
-_BLUE, _GREY, _RED = "#1a6bb5", "#999999", "#c8501e"
-_SIZE = (5.4, 3.6)
 _SECOND_NS = 1e9
-
-# Text stays text, and the same picture is the same file.
-mpl.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "flotilla", "font.size": 8, "font.family": "sans-serif"}
-
 
 VIRTUAL = (
     "It is an 802.11 ad hoc cell. All computers are namespaces of one guest in virtual time, which boots the system as "
@@ -35,8 +27,8 @@ VIRTUAL = (
 def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios", how: str = VIRTUAL) -> Path:
     """`flights` by title, `how` they were flown; the path of the page, which is called `name`."""
     directory.mkdir(parents=True, exist_ok=True)
-    figures = {title: summary(flight) for title, flight in flights.items()}
-    (directory / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
+    found = {title: summary(flight) for title, flight in flights.items()}
+    (directory / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n")
     page = directory / f"{name}.html"
     pictures = {title: _pictures(flight) for title, flight in flights.items()}
     hops = {
@@ -46,7 +38,7 @@ def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios
     page.write_text(
         _environment()
         .get_template("report.html.j2")
-        .render(figures=figures, pictures=pictures, hops=hops, how=how, degrees=math.degrees, limit_us=LIMIT_US)
+        .render(figures=found, pictures=pictures, hops=hops, how=how, degrees=math.degrees, limit_us=LIMIT_US)
     )
     return page
 
@@ -82,19 +74,18 @@ def write_crowds(crowds: Sequence[Crowd], directory: Path) -> Path:
 
 
 def _curve(crowds: Sequence[Crowd]) -> str:
-    figure = Figure(_SIZE, layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = figures.new()
     robots = [crowd.robots for crowd in crowds]
-    for name, percent, color in (("median", "50", _BLUE), ("99.9 %", "99.9", "black"), ("max", "100", _GREY)):
+    for name, percent, color in (("median", "50", BLUE), ("99.9 %", "99.9", "black"), ("max", "100", GREY)):
         values = [crowd.latency.percentiles_us[percent] / 1000 for crowd in crowds]
         axes.plot(robots, values, color=color, marker="o", markersize=3, linewidth=0.8, label=name)
-    axes.axhline(10, color=_RED, linewidth=0.8)
+    axes.axhline(10, color=RED, linewidth=0.8)
     axes.set(title="Four hops: the line is the period", xlabel="robots", ylabel="ms", xticks=robots, ylim=(0, None))
     axes.legend(loc="upper left")
     lost = axes.twinx()
-    lost.plot(robots, [100 * crowd.lost / crowd.steps for crowd in crowds], color=_RED, marker="x", linewidth=0)
+    lost.plot(robots, [100 * crowd.lost / crowd.steps for crowd in crowds], color=RED, marker="x", linewidth=0)
     lost.set(ylabel="lost, % (×)", ylim=(0, None))
-    return _drawn(figure)
+    return figures.svg(figure)
 
 
 def summary(flight: Flight) -> dict[str, object]:
@@ -130,15 +121,9 @@ def _pictures(flight: Flight) -> list[str]:
 
 
 def _svg(flight: Flight, draw: Callable[[Flight, Axes], None]) -> str:
-    figure = Figure(_SIZE, layout="constrained")
-    draw(flight, figure.add_subplot())
-    return _drawn(figure)
-
-
-def _drawn(figure: Figure) -> str:
-    out = io.StringIO()
-    figure.savefig(out, format="svg", metadata={"Date": None}, transparent=True)
-    return re.sub(r"(?s)^.*?(?=<svg)", "", out.getvalue())
+    figure, axes = figures.new()
+    draw(flight, axes)
+    return figures.svg(figure)
 
 
 def _seconds(flight: Flight, time_ns: int) -> float:
@@ -148,21 +133,21 @@ def _seconds(flight: Flight, time_ns: int) -> float:
 
 def _events(flight: Flight, axes: Axes) -> None:
     for time_ns in flight.events_ns:
-        axes.axvline(_seconds(flight, time_ns), color=_RED, linewidth=0.8)
+        axes.axvline(_seconds(flight, time_ns), color=RED, linewidth=0.8)
 
 
 def _trajectory(flight: Flight, axes: Axes) -> None:
     wanted = [record["wanted"] for record in flight.commanded]
-    axes.plot(*zip(*wanted, strict=True), color=_GREY, linewidth=2, label="commanded")
+    axes.plot(*zip(*wanted, strict=True), color=GREY, linewidth=2, label="commanded")
     flown = [record["pose"][:2] for record in flight.flown]
-    axes.plot(*zip(*flown, strict=True), color=_BLUE, linewidth=0.8, label="flown")
+    axes.plot(*zip(*flown, strict=True), color=BLUE, linewidth=0.8, label="flown")
     axes.set(title="Trajectory", xlabel="x, m", ylabel="y, m", aspect="equal")
     axes.legend(loc="center")
 
 
 def _heading(flight: Flight, axes: Axes) -> None:
     times = [_seconds(flight, record["time_ns"]) for record in flight.flown]
-    axes.plot(times, [math.degrees(record["pose"][2]) for record in flight.flown], color=_BLUE, linewidth=0.8)
+    axes.plot(times, [math.degrees(record["pose"][2]) for record in flight.flown], color=BLUE, linewidth=0.8)
     _events(flight, axes)
     axes.set(title="Heading", xlabel="s", ylabel="°")
 
@@ -175,7 +160,7 @@ def _valves(flight: Flight, axes: Axes) -> None:
             if now > was:
                 opened[valve].append((_seconds(flight, after["time_ns"]) - (now - was), now - was))
     for valve, spans in enumerate(opened):
-        axes.broken_barh(spans, (valve + 0.6, 0.8), facecolors=_BLUE, edgecolors=_BLUE, linewidth=0.5)
+        axes.broken_barh(spans, (valve + 0.6, 0.8), facecolors=BLUE, edgecolors=BLUE, linewidth=0.5)
     _events(flight, axes)
     axes.set(title="Valves open", xlabel="s", ylabel="thruster", yticks=range(1, len(opened) + 1))
     axes.set_xlim(0, _seconds(flight, flight.flown[-1]["time_ns"]))
@@ -183,18 +168,6 @@ def _valves(flight: Flight, axes: Axes) -> None:
 
 def _latency(flight: Flight, axes: Axes) -> None:
     for index, name in enumerate(HOPS if flight.one_clock else ()):
-        axes.stairs(*_bins(flight.hop(index).histogram_us), label=name, linewidth=0.8)
-    axes.stairs(*_bins(flight.latency().histogram_us), label="all four", color="black", linewidth=1.2)
-    axes.axvline(10, color=_RED, linewidth=0.8)
-    axes.set(title="Latency: the line is the period", xlabel="ms", ylabel="steps", xscale="log", yscale="log")
-    axes.legend(loc="upper right")
-
-
-def _bins(histogram_us: Mapping[int, int]) -> tuple[list[int], list[float]]:
-    """Counts and their edges in ms, twenty a decade from 0.1 ms to 100 ms."""
-    edges = [10 ** (step / 20 - 1) for step in range(61)]
-    counts = [0] * 60
-    for us, count in histogram_us.items():
-        step = math.floor((math.log10(max(us, 1) / 1000) + 1) * 20)
-        counts[min(max(step, 0), 59)] += count
-    return counts, edges
+        axes.stairs(*figures.latency_bins(flight.hop(index).histogram_us), label=name, linewidth=0.8)
+    axes.stairs(*figures.latency_bins(flight.latency().histogram_us), label="all four", color="black", linewidth=1.2)
+    figures.latency_axes(axes, "Latency: the line is the period", 10)

@@ -82,7 +82,7 @@ class Plan:
     standby: Mapping[str, str] = field(default_factory=dict)
     """Robots by name, and the control task for which each stands by."""
     second_station: bool = False
-    """A further station of the fleet hears what the first one hears, and says wrongly where the robot is."""
+    """A further station of the fleet receives what the first one does, and sends wrong positions of the robot."""
     stranger: bool = False
     """A computer that is not of the fleet sends to all ports of the control tasks, as often as they step."""
     changes: Mapping[str, object] = field(default_factory=dict)
@@ -169,7 +169,7 @@ def _own(template: str, **values: object) -> bytes:
 
 
 def station(described: Fleet) -> bytes:
-    """The station's task. It hears a stream of each task that sends one."""
+    """The station's task. It receives a stream of each task that sends one."""
     streams = {stream.task: stream for stream in telemetry.streams(described)}
     return _own("station.yml.j2", controllers=described.robots_with("control"), **streams)
 
@@ -294,10 +294,10 @@ def fly(plans: Sequence[Plan], board: Board, out: Path) -> dict[str, Path]:
 def far(console: str, flights: Mapping[str, float]) -> progress.Far:
     """How far a session is whose guest has written `console`; `flights`: virtual seconds of each, in their order."""
     total = sum(flights.values())
-    told = re.findall(r"flight: (\S+) ([\d.e+]+) s\n", console)
-    if not told:
+    moments = re.findall(r"flight: (\S+) ([\d.e+]+) s\n", console)
+    if not moments:
         return progress.Far(0, total, "virtual seconds", part="boot")
-    name, passed = told[-1]
+    name, passed = moments[-1]
     names = list(flights)
     before = sum(flights[each] for each in names[: names.index(name)])
     return progress.Far(before + float(passed), total, "virtual seconds", part=name)
@@ -323,11 +323,11 @@ def run(there: Mapping[str, bytes], board: Board, out: Path, flights: Mapping[st
     with progress.step(title, lambda: far(progress.text(console), flights)):
         document = results.received(guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds))
     initrd.unlink()
-    said = json.loads(document["commands"]["session"])
-    for name, content in said["files"].items():
+    answer = json.loads(document["commands"]["session"])
+    for name, content in answer["files"].items():
         file = out / "flights" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(base64.b64decode(content))
-    if "error" in said:
-        raise UserError(f"the flight failed in the guest:\n{said['error'].strip()}")
+    if "error" in answer:
+        raise UserError(f"the flight failed in the guest:\n{answer['error'].strip()}")
     return out / "flights"

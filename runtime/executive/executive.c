@@ -5,10 +5,10 @@
 #include "device.h"
 #include "privilege.h"
 #include "safety.h"
+#include "sampler.h"
 #include "schedule.h"
 #include "status.h"
 #include "tuner.h"
-#include "watch.h"
 
 #include <errno.h>
 #include <inttypes.h>
@@ -40,8 +40,9 @@ struct executive {
     const struct run_options *options;
     struct run_result *result;
     struct schedule *schedule;
-    struct watch *watch;   /* NULL: nothing is printed */
+    struct sampler *watch; /* NULL: nothing is printed */
     struct change *change; /* NULL: parameters stay as they are */
+    struct scope *scope;   /* NULL: nobody can watch signals */
     pthread_t control;
     int ended_fd;
     _Atomic bool stop, ended;
@@ -247,12 +248,14 @@ static void *control(void *argument)
         if (!options->no_wait)
             statistics_add(&result->jitter, begin_ns - release_ns);
         const struct fl_block *failed = schedule_step(executive->schedule, release_ns);
-        int64_t now_ns = fl_now_ns();
+        if (!failed && executive->scope)
+            scope_put(executive->scope, result->steps, release_ns);
+        int64_t now_ns = fl_now_ns(); /* what watchers cost counts as the step's */
         statistics_add(&result->step, now_ns - begin_ns);
         if (failed)
             end(result, failed->service->ended ? ENDING_DONE : ENDING_FAILED, failed, failed->service->failure);
         else if (executive->watch)
-            watch_put(executive->watch, result->steps, release_ns, options->no_wait);
+            sampler_put(executive->watch, result->steps, release_ns, options->no_wait);
         result->steps++;
         if (failed)
             break;
@@ -325,9 +328,13 @@ static void *guard(void *argument)
 /* End the task when the reader of its output has gone, as a signal would. */
 static void print_watched(struct executive *executive)
 {
-    int error = executive->watch ? watch_print(executive->watch) : 0;
-    if (error && !executive->output_error) {
-        executive->output_error = error;
+    if (!executive->watch)
+        return;
+    for (const struct row *row; (row = sampler_take(executive->watch));)
+        sampler_write(executive->watch, row, stdout);
+    errno = 0;
+    if ((fflush(stdout) != 0 || ferror(stdout)) && !executive->output_error) {
+        executive->output_error = errno ? errno : EPIPE;
         atomic_store(&executive->stop, true);
     }
 }
@@ -433,9 +440,10 @@ static void *run(void *argument)
     safety_begin(task);
     executive->ended_fd = eventfd(0, EFD_CLOEXEC);
     if (options->watched_count)
-        executive->watch = watch_create(options->watched, options->watched_count);
+        executive->watch = sampler_create(options->watched, options->watched_count);
     executive->schedule = schedule_create(task);
     executive->change = options->tuner ? tuner_change(options->tuner) : NULL;
+    executive->scope = options->tuner ? tuner_scope(options->tuner) : NULL;
     if (!options->no_wait)
         privilege_lock_memory();
     int priority = options->no_wait ? 0 : privilege_priority(task->priority, "steps will be late under load");
@@ -464,7 +472,7 @@ static void *run(void *argument)
     schedule_report(executive->schedule, task);
     schedule_destroy(executive->schedule);
     status_destroy(executive->status);
-    watch_destroy(executive->watch);
+    sampler_destroy(executive->watch);
     close(executive->ended_fd);
     close(signals_fd);
     return NULL;

@@ -2,7 +2,9 @@
 #include "tuner.h"
 
 #include "block.h"
+#include "client.h"
 #include "status.h"
+#include "stream.h"
 
 #include <errno.h>
 #include <inttypes.h>
@@ -18,17 +20,15 @@
 #include <unistd.h>
 
 enum {
-    REQUEST_BYTES = 512,
+    REQUEST_BYTES = STREAM_REQUEST_BYTES,
     REASON_BYTES = 512,
-    CLIENT_MS = 2000, /* for a request to arrive, and for an answer to leave */
-    QUEUED = 16,      /* connections waiting to be served */
-    FOR_EVER = -1,
+    QUEUED = 16, /* connections waiting to be served */
 };
-
-#define MILLISECOND_NS INT64_C(1000000)
 
 struct tuner {
     struct change change;
+    struct scope scope;
+    struct streams streams;
     struct task *task;
     const struct status *status;
     char *path;
@@ -53,30 +53,6 @@ static bool refuse(struct client *client, const char *format, ...)
     vsnprintf(client->reason, sizeof client->reason, format, arguments);
     va_end(arguments);
     return false;
-}
-
-/* --- waiting: for the end of the task, too --- */
-
-static int64_t deadline_in(int64_t milliseconds)
-{
-    return fl_now_ns() + milliseconds * MILLISECOND_NS;
-}
-
-/* Wait until one of `waiting`, from the second on, is ready; the first is the tuner's own. False at the deadline
- * (FOR_EVER: none) and when the task ends. */
-static bool await(const struct tuner *tuner, struct pollfd *waiting, nfds_t count, int64_t deadline_ns)
-{
-    waiting[0] = (struct pollfd){.fd = tuner->stop_fd, .events = POLLIN};
-    for (;;) {
-        int64_t left_ms = (deadline_ns - fl_now_ns() + MILLISECOND_NS - 1) / MILLISECOND_NS;
-        int timeout_ms = deadline_ns == FOR_EVER ? -1
-                                                 : (int)(left_ms < 0           ? 0
-                                                         : left_ms < INT32_MAX ? left_ms
-                                                                               : INT32_MAX);
-        int ready = poll(waiting, count, timeout_ms);
-        if (ready >= 0 || errno != EINTR)
-            return ready > 0 && !waiting[0].revents;
-    }
 }
 
 /* --- what is asked --- */
@@ -146,6 +122,19 @@ static bool list(const struct tuner *tuner, struct client *client)
     return true;
 }
 
+static bool list_signals(const struct tuner *tuner, struct client *client)
+{
+    for (size_t i = 0; i < tuner->task->count; i++) {
+        const struct fl_block *block = tuner->task->blocks[i].block;
+        for (uint32_t p = 0; p < block->out_count; p++) {
+            const struct fl_port *port = &block->out_ports[p];
+            fprintf(client->answer, "%s.%s %s %" PRIu32 "%s%s\n", block->name, port->name, fl_type_name(port->type),
+                    port->width, port->unit && *port->unit ? " " : "", port->unit ? port->unit : "");
+        }
+    }
+    return true;
+}
+
 static bool get(const struct tuner *tuner, struct client *client, char *name)
 {
     struct fl_block *block;
@@ -184,10 +173,10 @@ static bool judge(struct client *client, const struct fl_block *block, const str
  * client has gone. */
 static bool await_taken(struct tuner *tuner, struct client *client, uint64_t *step)
 {
-    int64_t deadline_ns = fl_now_ns() + 2 * tuner->task->period_ns + CLIENT_MS * MILLISECOND_NS;
+    int64_t deadline_ns = client_deadline(CLIENT_MS) + 2 * tuner->task->period_ns;
     for (;;) {
         struct pollfd waiting[] = {{0}, {.fd = tuner->change.taken_fd, .events = POLLIN}, {.fd = client->fd}};
-        bool ready = await(tuner, waiting, 3, deadline_ns);
+        bool ready = client_await(tuner->stop_fd, waiting, 3, deadline_ns);
         if (change_taken(&tuner->change, step))
             return true;
         if (ready && !waiting[2].revents)
@@ -228,57 +217,37 @@ static bool send_status(const struct tuner *tuner, struct client *client, bool j
     return true;
 }
 
+/* The client is a stream's from then on. */
+static bool watch(struct tuner *tuner, struct client *client, const char *request)
+{
+    if (!stream_begin(&tuner->streams, &tuner->scope, tuner->task, client->fd, tuner->stop_fd, request, client->reason,
+                      sizeof client->reason))
+        return false;
+    client->fd = -1;
+    return true;
+}
+
 static bool obey(struct tuner *tuner, struct client *client)
 {
-    char *rest = client->request, *verb = strsep(&rest, " "), *name = strsep(&rest, " ");
+    char *rest = client->request, *verb = strsep(&rest, " ");
+    if (strcmp(verb, "watch") == 0 && rest)
+        return watch(tuner, client, rest);
+    char *name = strsep(&rest, " ");
     if (strcmp(verb, "list") == 0 && !name)
         return list(tuner, client);
     if (strcmp(verb, "get") == 0 && name && !rest)
         return get(tuner, client, name);
     if (strcmp(verb, "set") == 0 && name && rest)
         return set(tuner, client, name, rest);
+    if (strcmp(verb, "signals") == 0 && !name)
+        return list_signals(tuner, client);
     if (strcmp(verb, "status") == 0 && (!name || (strcmp(name, "json") == 0 && !rest)))
         return send_status(tuner, client, name);
-    return refuse(
-        client, "unknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, status json");
+    return refuse(client, "unknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, "
+                          "status json, signals, watch SIGNAL...");
 }
 
 /* --- clients --- */
-
-/* A line, without its end; false when none comes. */
-static bool receive(const struct tuner *tuner, struct client *client)
-{
-    size_t used = 0;
-    int64_t deadline_ns = deadline_in(CLIENT_MS);
-    struct pollfd waiting[] = {{0}, {.fd = client->fd, .events = POLLIN}};
-    while (await(tuner, waiting, 2, deadline_ns)) {
-        ssize_t got = recv(client->fd, client->request + used, sizeof client->request - used, MSG_DONTWAIT);
-        if (got <= 0)
-            return false;
-        char *end = memchr(client->request + used, '\n', (size_t)got);
-        used += (size_t)got;
-        if (end) {
-            *end = '\0';
-            return strlen(client->request) == (size_t)(end - client->request);
-        }
-        if (used == sizeof client->request)
-            return false;
-    }
-    return false;
-}
-
-static void send_all(const struct tuner *tuner, const struct client *client, const char *text, size_t length)
-{
-    int64_t deadline_ns = deadline_in(CLIENT_MS);
-    struct pollfd waiting[] = {{0}, {.fd = client->fd, .events = POLLOUT}};
-    while (length && await(tuner, waiting, 2, deadline_ns)) {
-        ssize_t sent = send(client->fd, text, length, MSG_DONTWAIT | MSG_NOSIGNAL);
-        if (sent < 0)
-            return;
-        text += sent;
-        length -= (size_t)sent;
-    }
-}
 
 static void serve_client(struct tuner *tuner, struct client *client)
 {
@@ -287,7 +256,7 @@ static void serve_client(struct tuner *tuner, struct client *client)
     client->answer = open_memstream(&text, &length);
     if (!client->answer)
         return;
-    if (receive(tuner, client)) {
+    if (client_receive(tuner->stop_fd, client->fd, client->request, sizeof client->request)) {
         bool setting = strncmp(client->request, "set", 3) == 0;
         fputs("ok\n", client->answer);
         bool done = obey(tuner, client);
@@ -297,7 +266,8 @@ static void serve_client(struct tuner *tuner, struct client *client)
         if (!done && fseek(client->answer, 0, SEEK_SET) == 0)
             fprintf(client->answer, "error\n%s\n", client->reason);
         fflush(client->answer);
-        send_all(tuner, client, text, length);
+        if (client->fd >= 0)
+            client_send(tuner->stop_fd, client->fd, text, length);
     }
     fclose(client->answer);
     free(text);
@@ -307,18 +277,19 @@ static void *serve(void *argument)
 {
     struct tuner *tuner = argument;
     struct pollfd waiting[] = {{0}, {.fd = tuner->listen_fd, .events = POLLIN}};
-    while (await(tuner, waiting, 2, FOR_EVER)) {
+    while (client_await(tuner->stop_fd, waiting, 2, CLIENT_FOR_EVER)) {
         struct ucred peer = {.uid = (uid_t)-1};
         struct client client = {.fd = accept4(tuner->listen_fd, NULL, NULL, SOCK_CLOEXEC)};
         if (client.fd < 0) {
             if (errno != EAGAIN) /* no descriptor or no memory is left, which may pass */
-                await(tuner, waiting, 1, deadline_in(CLIENT_MS));
+                client_await(tuner->stop_fd, waiting, 1, client_deadline(CLIENT_MS));
             continue;
         }
         getsockopt(client.fd, SOL_SOCKET, SO_PEERCRED, &peer, &(socklen_t){sizeof peer});
         client.user = peer.uid;
         serve_client(tuner, &client);
-        close(client.fd);
+        if (client.fd >= 0)
+            close(client.fd);
     }
     return NULL;
 }
@@ -407,11 +378,17 @@ struct change *tuner_change(struct tuner *tuner)
     return &tuner->change;
 }
 
+struct scope *tuner_scope(struct tuner *tuner)
+{
+    return &tuner->scope;
+}
+
 void tuner_stop(struct tuner *tuner)
 {
     if (!tuner->started)
         return;
     eventfd_write(tuner->stop_fd, 1);
     pthread_join(tuner->thread, NULL);
+    streams_join(&tuner->streams);
     tuner->started = false;
 }

@@ -1,7 +1,8 @@
 /* flotilla-param: reads and sets parameters of a running task, and asks for its state, through the socket that tuner.h
  * describes. */
 #define _GNU_SOURCE
-#include <errno.h>
+#include "task_socket.h"
+
 #include <getopt.h>
 #include <limits.h>
 #include <poll.h>
@@ -10,7 +11,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
-#include <sys/un.h>
 #include <unistd.h>
 
 static const char usage[] =
@@ -35,27 +35,6 @@ static const struct option options[] = {
     {0},
 };
 
-static int connected(const char *task, const char *path)
-{
-    struct sockaddr_un address = {.sun_family = AF_UNIX};
-    size_t length = strlen(path);
-    int fd = -1;
-    if (length >= sizeof address.sun_path)
-        errno = ENAMETOOLONG;
-    else if ((fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0)) >= 0) {
-        memcpy(address.sun_path, path, length);
-        if (connect(fd, (struct sockaddr *)&address, sizeof address) == 0)
-            return fd;
-    }
-    if (errno == ENOENT || errno == ECONNREFUSED)
-        fprintf(stderr, "flotilla-param: no task %s runs here: nobody listens at %s\n", task, path);
-    else if (errno == EACCES)
-        fprintf(stderr, "flotilla-param: %s: only the user who runs task %s may, and root\n", path, task);
-    else
-        fprintf(stderr, "flotilla-param: %s: %s\n", path, strerror(errno));
-    return -1;
-}
-
 /* Read until the other end closes; NULL on time-out. To be freed. */
 static char *answer_of(int fd)
 {
@@ -77,7 +56,7 @@ static char *answer_of(int fd)
 /* Make one request; returns the exit status. */
 static int ask(const char *task, const char *path, const char *request, size_t length)
 {
-    int fd = connected(task, path), status = 1;
+    int fd = task_socket_connect(task, path), status = 1;
     if (fd < 0)
         return 1;
     char *answer = send(fd, request, length, MSG_NOSIGNAL) == (ssize_t)length ? answer_of(fd) : NULL;
@@ -107,26 +86,6 @@ static bool write_request(char **request, size_t *length, const char *verb, char
     bool good = (count == 0 || !strpbrk(words[0], " \n")) && (count < 2 || !strchr(words[1], '\n'));
     fputc('\n', out);
     return fclose(out) == 0 && good;
-}
-
-/* Where services have their sockets: control tasks, and apps. */
-static const char *const directories[] = {"/run/flotilla", "/run/flotilla-apps"};
-
-/* The socket of the service of that name: of a task or of an app. False when both exist. */
-static bool find_socket(const char *name, char *path, size_t size)
-{
-    char other[PATH_MAX];
-    snprintf(path, size, "%s/%s/control", directories[0], name);
-    snprintf(other, sizeof other, "%s/%s/control", directories[1], name);
-    if (access(other, F_OK) < 0)
-        return true;
-    if (access(path, F_OK) == 0) {
-        fprintf(stderr, "flotilla-param: a control task and an app are named %s: say which by --control %s or %s\n",
-                name, path, other);
-        return false;
-    }
-    snprintf(path, size, "%s", other);
-    return true;
 }
 
 int main(int argc, char **argv)
@@ -163,7 +122,7 @@ int main(int argc, char **argv)
         fputs(usage, stderr);
         return 2;
     }
-    if (!path && !find_socket(argv[optind], usual, sizeof usual))
+    if (!path && !task_socket_find(argv[optind], usual, sizeof usual))
         return 1;
     int done = ask(argv[optind], path ? path : usual, request, length);
     free(request);

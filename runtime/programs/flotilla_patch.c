@@ -21,7 +21,7 @@ static const char usage[] =
     "Status: 0 done, 1 an error of the system, 2 the command line is wrong, 3 the delta is wrong, or ends early.\n";
 
 enum {
-    WINDOW = 1 << 20, /* bytes of the result at a time, as flotilla/updates/delta.py has it made */
+    WINDOW = 1 << 18, /* bytes of the result at a time, as flotilla/updates/delta.py has it made */
     NEAR = 4,         /* addresses that were used last */
     SAME = 3,         /* × 256 addresses by their remainder */
 };
@@ -221,6 +221,8 @@ static int patch(FILE *in, int base)
     bool good = fread(found, 1, sizeof found, in) == sizeof found && memcmp(found, magic, sizeof magic) == 0;
     for (int indicator; good && (indicator = getc(in)) != EOF;) {
         good = read_window(in, indicator, &window) && make_window(&window, base);
+        /* The page cache belongs to the control tasks. */
+        (void)posix_fadvise(base, 0, 0, POSIX_FADV_DONTNEED);
         if (good && !write_result(window.length)) {
             fprintf(stderr, "flotilla-patch: output: %s\n", strerror(errno));
             return 1;

@@ -208,6 +208,8 @@ blocks:
     type: differential-odometry
     in: {left: wheels.left, right: wheels.right}
     parameters: {radius: 0.1, track: 0.4}
+  attitude: {type: angles-to-quaternion, in: {roll: limited.out, pitch: turned.y, yaw: before.out}}
+  angles: {type: quaternion-to-angles, in: {quaternion: attitude.quaternion}}
   valves:
     type: thruster-mapping
     in: {force_x: chosen.out, force_y: turned.y, torque: 0.05}
@@ -222,7 +224,8 @@ OBSERVED = (
     "clock.time,clock.step,bytes.out,step.out0,step.out1,path.position,path.velocity,path.acceleration,path.done,"
     "bias.out,biased.out,scaled.out,both.out,filtered.out,limited.out,limited.limited,turned.x,turned.y,before.out,"
     "way.out,observed.value,observed.rate,control.out,control.saturated,switch.on,switch.sign,any.out,chosen.out,"
-    "wheels.left,wheels.right,wheels.limited,pose.v,pose.omega,pose.x,pose.y,pose.heading,valves.valves,valves.on_time,"
+    "wheels.left,wheels.right,wheels.limited,pose.v,pose.omega,pose.x,pose.y,pose.heading,attitude.quaternion,"
+    "angles.roll,angles.pitch,angles.yaw,valves.valves,valves.on_time,"
     "valves.achieved,valves.saturated,spots.count,spots.x,spots.y,spots.brightness,spots.flag,spots.sequence"
 )
 
@@ -472,6 +475,7 @@ test_a_drive_that_lost_its_power_comes_back = can.test_a_drive_that_lost_its_pow
 test_udp_from_task_to_task = io.test_udp_from_task_to_task
 test_queue_between_two_rates = io.test_queue_between_two_rates
 test_a_topic_between_two_tasks = dds.test_a_topic_between_two_tasks
+test_a_message_of_ros_between_two_tasks = dds.test_a_message_of_ros_between_two_tasks
 
 # --- signals ---
 
@@ -529,6 +533,7 @@ def test_every_block_is_tested(lab: DeviceBench) -> None:
         test_udp_from_task_to_task: io.SENDER + io.RECEIVER,
         test_queue_between_two_rates: io.QUEUE_SENDER + io.QUEUE_RECEIVER,
         test_a_topic_between_two_tasks: dds.SENDER + dds.RECEIVER,
+        test_a_message_of_ros_between_two_tasks: dds.ROS_SENDER + dds.ROS_RECEIVER,
         test_signals_are_those_of_this_computer: SIGNALS,
         test_recording_is_read_back: signals.RECORDED,
     }

@@ -19,10 +19,13 @@ from images.builder import card, environment_block, tools
 from images.builder.build import image_of
 from images.builder.lock import read_lock
 from images.builder.tools import Tools
+from lab.qemu import qemu
 from lab.qemu.boot_loader import BootLoader, Started, State, StubCard, header_place, initrd_place, kernel_place
 
 ROBOT = 3
 SEED = 3
+CLEARED = "\x1b[1;1H"
+"""What GRUB says first."""
 A, B = card.SLOTS
 TRIES = card.STATE.start + card.TRIES
 COPIES = [card.STATE.start + place for place in card.COPIES]
@@ -157,7 +160,8 @@ def check(loader: BootLoader, name: str, state: State) -> Started:
 
 def test_every_state_leads_to_its_slot(loader: BootLoader) -> None:
     """Every seventh of the states that can be written, with the tries that can be counted: by the rules who is
-    started, and what is counted."""
+    started, and what is counted. Seen to fail where A's tries are never read, where A is good whatever the state says,
+    where a third try does not end A, and without the word `flotilla.trial`."""
     states = itertools.product(("A B", "B A"), ("A", "B", "AB"), ("", "A", "B"), range(4), range(4))
     for order, good, trial, a, b in itertools.islice(states, 0, None, 7):
         content = card.state_copy(5, order=order, good=good, trial=trial)
@@ -173,7 +177,8 @@ def test_every_state_leads_to_its_slot(loader: BootLoader) -> None:
 
 
 def test_the_newer_valid_copy_counts(loader: BootLoader) -> None:
-    """Also where the other copy is torn or lost."""
+    """Also where the other copy is torn or lost. Seen to fail where the later one in the file counts, and where the end
+    mark is not compared."""
     old, new = card.state_copy(9, good="AB"), card.state_copy(10, order="B A", good="AB")
     torn = new.replace(b"END=10", b"END=9#")
     damaged = [bytes(512), b"\xff" * 512, torn, new[:60] + bytes(452)]
@@ -186,13 +191,18 @@ def test_the_newer_valid_copy_counts(loader: BootLoader) -> None:
 
 
 def test_tries_of_another_state_do_not_count(loader: BootLoader) -> None:
+    """Seen to fail where B's tries count whatever they are for."""
     on_trial = copies(card.state_copy(6, good="A", trial="B"))
     assert check(loader, "tried before", {**on_trial, **tries(6, 0, 1)}).slot == "A"
     assert check(loader, "of the state before", {**on_trial, **tries(5, 0, 1)}).slot == "B"
 
 
 def test_no_trial_where_the_card_keeps_no_count(loader: BootLoader) -> None:
-    """It would be tried at every start."""
+    """It would be tried at every start. Elsewhere: the count is written, but not where it is read at the next start.
+
+    Seen to fail, with the last case, where the count is not compared when it is read back; without the last, only where
+    the result of `count` is not looked at either.
+    """
     on_trial = copies(card.state_copy(6, good="A", trial="B"))
     for name, damage in (
         ("no name", {card.STATE.start: bytes(512)}),
@@ -201,6 +211,7 @@ def test_no_trial_where_the_card_keeps_no_count(loader: BootLoader) -> None:
             "another size",
             {card.STATE.start: loader.read(card.STATE.start, 512).replace(b"00000001000", b"00000000000")},
         ),
+        ("elsewhere", {card.STATE.start: card.tries_block("other") + card.tries_block()}),
     ):
         assert check(loader, name, {**on_trial, **damage}).slot == "A", name
 
@@ -217,6 +228,7 @@ def test_a_slot_is_started_whatever_the_sectors_hold(loader: BootLoader) -> None
 
 
 def test_nothing_but_the_count_is_written(loader: BootLoader, stubbed: StubCard) -> None:
+    """Seen to fail with another name in the block."""
     check(loader, "as made", {header_place(B): bytes(1024)})
     assert counted(loader) == {"FOR": "1", "A_TRIES": "1", "B_TRIES": "0"}
     before = bytearray(stubbed.state)
@@ -225,13 +237,19 @@ def test_nothing_but_the_count_is_written(loader: BootLoader, stubbed: StubCard)
 
 
 def test_on_a_new_card_only_the_slot_with_a_header_is_started(loader: BootLoader) -> None:
+    """And its starts are counted, whatever the empty one is said to be: seen to fail where an empty slot is chosen, in
+    its turn or on trial."""
     empty = {header_place(B): bytes(1024)}
-    for content in (card.state_copy(), card.state_copy(2, order="B A", good="AB"), bytes(512)):
+    states = [card.state_copy(), card.state_copy(2, order="B A", good="AB"), bytes(512), card.state_copy(2, trial="B")]
+    for content in states:
         assert check(loader, repr(content[:70]), {**empty, **copies(content)}).slot == "A"
-    assert check(loader, "trial of nothing", {**empty, **copies(card.state_copy(2, trial="B"))}).slot == "A"
+        left = counted(loader)
+        assert (left["A_TRIES"], left["B_TRIES"]) == ("1", "0"), f"{content[:70]!r}: {left}"
 
 
 def test_a_slot_that_cannot_be_loaded_is_passed_over(loader: BootLoader, stubbed: StubCard) -> None:
+    """Seen to fail where nothing follows the chosen slot, where an initramfs that fails does not matter, and where the
+    slot's tries are not used up."""
     both = copies(card.state_copy(2, good="AB"))
     for name, state in (
         ("no kernel", {kernel_place(A): bytes(512)}),
@@ -241,10 +259,13 @@ def test_a_slot_that_cannot_be_loaded_is_passed_over(loader: BootLoader, stubbed
         ("no place", {header_place(A): stubbed.header(KERNEL="x")}),
         ("an initramfs beyond the card", {header_place(A): stubbed.header(INITRD="99999999+4")}),
     ):
-        assert check(loader, name, {**both, **state}).slot == "B", name
+        started = check(loader, name, {**both, **state})
+        assert started.slot == "B", name
+        assert started.said.count(CLEARED) <= 2, f"{name}: the slot was loaded again"
 
 
 def test_sectors_that_cannot_be_read(board: Board, stubbed: StubCard, tmp_path: Path) -> None:
+    """Seen to fail where nothing follows the chosen slot, and where an initramfs that fails does not matter."""
     for place, slot in (
         (TRIES, "B"), (COPIES[0], "B"), (COPIES[1], "B"), (header_place(B), "A"), (kernel_place(B), "A"),
         (initrd_place(B) + 512, "A"),
@@ -256,7 +277,7 @@ def test_sectors_that_cannot_be_read(board: Board, stubbed: StubCard, tmp_path: 
 
 
 def test_a_kernel_without_an_initramfs(board: Board, stubbed: StubCard, toolset: Tools, tmp_path: Path) -> None:
-    """As our own is; and a board without a watchdog."""
+    """As our own is; and a board without a watchdog. Seen to fail where GRUB loads an initramfs for any kernel."""
     none = {header_place(slot): stubbed.header(INITRD="") for slot in card.SLOTS}
     for each in (board, board.model_copy(update={"watchdog": None})):
         core = card.grub_core(each, toolset, tmp_path, card.grub_config(each))
@@ -269,13 +290,23 @@ def test_a_kernel_without_an_initramfs(board: Board, stubbed: StubCard, toolset:
 def test_the_watchdog_runs_before_the_kernel_does(
     board: Board, loader: BootLoader, stubbed: StubCard, toolset: Tools, tmp_path: Path
 ) -> None:
-    """The stub stands still, as a kernel may; and GRUB itself may, here in its first line."""
+    """The stub stands still, as a kernel may; and GRUB itself may, here in its first line. A kernel has the whole time,
+    however long GRUB took: seen to fail where GRUB does not start it again."""
     check(loader, "as made", {})
     assert loader.wait_event("WATCHDOG", 60)
     head = stubbed.with_core(card.grub_core(board, toolset, tmp_path, b"sleep 100\n"))
     with BootLoader(board, stubbed, tmp_path / "asleep", head=head) as asleep:
         asleep.plant({})
         assert asleep.wait_event("WATCHDOG", 60)
+    slow_s, watchdog_s = 20, 30
+    head = stubbed.with_core(
+        card.grub_core(board, toolset, tmp_path, f"sleep {slow_s}\n".encode() + card.grub_config(board))
+    )
+    with BootLoader(board, stubbed, tmp_path / "slow", head=head) as slow:
+        slow.execute("watchdog-set-action", action="pause")
+        check(slow, "slow", {})
+        assert slow.wait_event("WATCHDOG", 60)
+        assert qemu.virtual_s(slow.execute) >= slow_s + watchdog_s
 
 
 def test_a_configuration_that_believes_the_state_is_refused(

@@ -21,7 +21,7 @@ import yaml
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.transport import duration_s
-from flotilla.robot import parameters, ssh
+from flotilla.robot import parameters, scope, ssh
 from lab.emulators.dsp3000 import Dsp3000
 from lab.emulators.ir104 import Ir104
 from lab.emulators.serial_line import SerialLine, UnixSocket
@@ -221,6 +221,23 @@ def test_parameters_are_set_from_the_station(loop: Loop, monkeypatch: pytest.Mon
     with pytest.raises(UserError, match="robot1: no task bearing runs here"):
         parameters.param(robot, "bearing")
     parameters.param(robot, "heading", "attitude.kp", str(file["kp"]))
+
+
+def watching(*signals: str) -> list[str]:
+    return scope.words("heading", signals, every=5, rows=20, trigger=None, before=None, csv=True)
+
+
+def test_signals_are_watched_from_the_station(loop: Loop, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """By the user who may log in, as the station does."""
+    robot = loop.robot.robot
+    monkeypatch.setattr(ssh, "forwarded_port", lambda _: loop.robot.machine.ssh_port())
+    assert scope.record(robot, watching("gyro.rate", "gyro.flag"), tmp_path / "rates.csv") == 20
+    head, *rows = [line.split(",") for line in (tmp_path / "rates.csv").read_text().splitlines()]
+    assert head == ["step", "release_ns", "lost", "gyro.rate", "gyro.flag"]
+    steps = [int(row[0]) for row in rows]
+    assert steps == list(range(steps[0], steps[0] + 100, 5))
+    with pytest.raises(UserError, match=r"robot1: task heading: gyro\.rat: dsp3000 has no output rat; it has rate, "):
+        scope.show(robot, watching("gyro.rat"))
 
 
 def test_parameters_are_the_users_of_the_task_alone(loop: Loop) -> None:

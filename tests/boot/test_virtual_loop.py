@@ -13,11 +13,13 @@ from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
 from lab.latency import virtual_loop
 from lab.latency.results import Latency
-from lab.latency.virtual_loop import SECONDS, TARGET_RAD_S, run
+from lab.latency.virtual_loop import CLIENTS, SECONDS, TARGET_RAD_S, WATCH_ROWS, run
 
 UNREADY = 80
 """Frames that give no rate: those until the driver is sure of the gyro's mode, and those that its commands garble, as
 this line brings them back. It says the mode anew every 100 frames. The accepted histogram counts them exactly."""
+WATCH_LIMIT_NS = 100_000
+"""The jitter that is allowed."""
 SETTLED = 300
 """Steps after which the velocity loop, whose drive first has to be configured, has to hold."""
 
@@ -70,6 +72,22 @@ def test_two_rates_on_one_computer_keep_their_time(said: dict[str, str]) -> None
     print(f"jitter: {fast['jitter']['max_ns'] / 1000} µs at 10 ms, {slow['jitter']['max_ns'] / 1000} µs at 100 ms")
     assert fast["jitter"]["max_ns"] < 100_000
     assert slow["jitter"]["max_ns"] < 100_000
+
+
+def test_who_watches_a_task_costs_it_little_and_no_step(said: dict[str, str]) -> None:
+    """Four clients with eight signals each at 1 kHz, each step of the task."""
+    alone, watched = read(said["task_alone"]), read(said["task_watched"])
+    assert (alone["overruns"], watched["overruns"]) == (0, 0)
+    assert alone["step"]["count"] == watched["step"]["count"] == SECONDS * 1000
+    rows = [read(line) for line in said["watched_rows"].splitlines()]
+    assert len(rows) == CLIENTS * WATCH_ROWS
+    assert {row["lost"] for row in rows} == {0}
+    mean_ns = watched["step"]["mean_ns"] - alone["step"]["mean_ns"]
+    print(
+        f"a step at 1 kHz: {alone['step']['mean_ns'] / 1000} µs in the mean alone, {mean_ns / 1000} µs more while "
+        f"watched; at most {alone['step']['max_ns'] / 1000} and {watched['step']['max_ns'] / 1000} µs"
+    )
+    assert watched["step"]["max_ns"] - alone["step"]["max_ns"] < WATCH_LIMIT_NS
 
 
 def test_a_drive_on_can_holds_its_velocity(said: dict[str, str]) -> None:

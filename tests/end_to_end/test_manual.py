@@ -82,6 +82,15 @@ ELSEWHERE = {
     "make lock": "asks the mirror for other packages; unit/test_lock.py",
     "make param ROBOT=1 TASK=heading": "needs the robot; test_control_loop.py asks a guest",
     "make param ROBOT=1 TASK=heading PARAM=attitude.kp VALUE=2.5": "needs the robot; test_control_loop.py asks a guest",
+    **dict.fromkeys(
+        (
+            "make scope ROBOT=1 TASK=heading",
+            'make scope ROBOT=1 TASK=heading SIGNALS="gyro.rate attitude.out" EVERY=10',
+            'make scope ROBOT=1 TASK=heading SIGNALS="gyro.rate attitude.out" TRIGGER="gyro.rate>0.1" BEFORE=100 '
+            "ROWS=1000 CSV=push.csv",
+        ),
+        "needs the robot; test_control_loop.py asks a guest",
+    ),
     "make deploy ROBOT=3 APP=apps/hover": "runs until Ctrl-C; test_deploy.py",
     "make deploy ROBOT=3 APP=apps/hover RUN=status": "needs the robot; test_deploy.py asks a guest",
     "make deploy ROBOT=3 APP=apps/hover ON_ROBOT=1": "needs the robot; test_deploy.py compiles on a guest",

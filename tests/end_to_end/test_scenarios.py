@@ -239,8 +239,8 @@ def test_strangers_are_refused_and_counted(flights: Callable[[str], Flight]) -> 
 def test_a_second_station_hears_the_same_and_disturbs_nobody(flights: Callable[[str], Flight]) -> None:
     """Its positions are a metre off, and the square is flown all the same; it goes on when the first one is gone."""
     flight = flights("strangers")
-    first, second = ([record["number"] for record in heard] for heard in (flight.steps, flight.heard_too))
-    gone = [record for record in flight.heard_too if record["time_ns"] > flight.events_ns[-1]]
+    first, second = ([record["number"] for record in heard] for heard in (flight.steps, flight.second_station))
+    gone = [record for record in flight.second_station if record["time_ns"] > flight.events_ns[-1]]
     print(f"the first heard of {len(set(first))} steps, the second of {len(set(second))}, {len(gone)} of them alone")
     assert len(set(first) - set(second)) <= 0.001 * len(first)
     assert len(gone) > 300

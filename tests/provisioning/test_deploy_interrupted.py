@@ -21,7 +21,6 @@ import pytest
 
 from flotilla.apps import app, builder, remote
 from flotilla.cli import main as command_line
-from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet
@@ -46,20 +45,8 @@ def said(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> dict[str, An
     work = tmp_path_factory.mktemp("light")
     directory = scale.describe(1, fleet.robots[4].board, work / "inventory")
     image = scale.image_for(fleet, fleet.robots[4].board)
-    argv = [
-        sys.executable,
-        "-m",
-        "tests.provisioning.test_deploy_interrupted",
-        "main",
-        *map(str, (directory, image, work)),
-    ]
-    try:
-        done = subprocess.run(
-            container.inside(argv), env=scale.environment(work), cwd=paths.PROJECT, capture_output=True, text=True,
-            check=False, timeout=RUN_SECONDS,
-        )  # fmt: skip
-    finally:
-        container.clean()
+    module = "tests.provisioning.test_deploy_interrupted"
+    done = scale.run_inside(work, module, "main", directory, image, work, timeout=RUN_SECONDS)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found

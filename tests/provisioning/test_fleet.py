@@ -102,10 +102,10 @@ AT_ONCE = ("-e", json.dumps({"waves": ["100%"]}))
 
 
 @contextlib.contextmanager
-def running(fleet: Fleet, robots: list[Robot], directory: Path) -> Iterator[Guests]:
-    """Guests of these robots on one segment, booted."""
+def running(fleet: Fleet, robots: list[Robot], directory: Path, **plugged: Mapping[str, str]) -> Iterator[Guests]:
+    """Guests of these robots on one segment, booted. `plugged`: into ports of some, as `qemu.Options.ports`."""
     with contextlib.ExitStack() as stack:
-        machines, segment = stack.enter_context(virtual.running(fleet, robots, directory))
+        machines, segment = stack.enter_context(virtual.running(fleet, robots, directory, plugged))
         ports = {robot.name: segment.ssh_port(robot.address) for robot in robots}
         shells = {}
         for robot in robots:

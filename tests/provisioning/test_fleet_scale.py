@@ -63,15 +63,9 @@ def test_drift_of_one_is_found_and_mended(fleet: Fleet, tmp_path: Path) -> None:
     """The first run also shows that a run which changed a robot is refused."""
     directory = scale.describe(4, fleet.robots[4].board, tmp_path / "inventory")
     image = scale.image_for(fleet, fleet.robots[4].board)
-    argv = [sys.executable, "-m", "tests.provisioning.test_fleet_scale", str(directory), str(image), str(tmp_path)]
     before = left()
-    try:
-        done = subprocess.run(
-            container.inside(argv), env=scale.environment(tmp_path), cwd=paths.PROJECT, capture_output=True, text=True,
-            check=False, timeout=RUN_SECONDS,
-        )  # fmt: skip
-    finally:
-        container.clean()
+    module = "tests.provisioning.test_fleet_scale"
+    done = scale.run_inside(tmp_path, module, directory, image, tmp_path, timeout=RUN_SECONDS)
     assert done.returncode == 0, done.stderr
     refused, first, second = json.loads(done.stdout)
     names = [f"robot{number}" for number in range(1, 5)]

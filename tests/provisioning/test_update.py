@@ -1,12 +1,13 @@
-"""Releases over the air, on a guest of the shipped image: one that does well stays, others go back by themselves.
+"""Releases over the air, on guests of the shipped image: one that does well stays, others go back by themselves.
 
-Releases differ by their header here, and so by their boot arguments: they are made in no time, and bad in any way.
+How releases are made bad is in tests/releases.py. That a robot is back within fifteen minutes, whatever the station
+does, is in tests/boot/test_bad_releases.py, by the robot's own time.
 """
 
 from __future__ import annotations
 
 import json
-import os
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,87 +16,180 @@ import pytest
 
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
-from images.builder import build, bundle
-from tests.provisioning.test_fleet import Guests, Playbook, running
+from flotilla.robot import release
+from flotilla.updates import delta
+from images.builder import build
+from lab.emulators.dsp3000 import Dsp3000
+from lab.emulators.serial_line import SerialLine, UnixSocket
+from lab.qemu import qemu
+from tests.figures import PROPERTY
+from tests.provisioning.test_fleet import BOOT_SECONDS, Guests, Playbook, running
+from tests.releases import successor
 
-ROBOT = 1
-"""It has a control task."""
-NAME = f"robot{ROBOT}"
+ROBOTS = 1, 4
+"""Of one board. The first has a control task and a gyro, the second has neither."""
+NAME, OTHER = (f"robot{number}" for number in ROBOTS)
 MEMORY_KIB = 16 << 10
+SECONDS = 600
 STOP = ("-e", "stop_tasks=true", "-e", "settle_s=2")
+ONE = ("-l", NAME)
+GOOD = (
+    f"timeout {SECONDS} sh -c 'until flotilla-param --status=json heading | grep -q gyro.:...flag.:.true; do :; done'"
+)
+"""Until the control task says that its gyro is good."""
+UPDATER = "/usr/lib/flotilla/update.py"
 
 Make = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
 def guests(fleet: Fleet, session_artefacts: Path) -> Iterator[Guests]:
-    with running(fleet, [inventory.robot(fleet, ROBOT)], session_artefacts / "update") as guests:
-        yield guests
+    robots = [inventory.robot(fleet, number) for number in ROBOTS]
+    with tempfile.TemporaryDirectory(prefix="lab-") as scratch:  # sockets' paths must be short
+        gyro = Path(scratch, "gyro")
+        plugged = {NAME: {robots[0].devices["gyro"].port: qemu.unix_socket(gyro)}}
+        with (
+            running(fleet, robots, session_artefacts / "update", **plugged) as guests,
+            SerialLine(Dsp3000(), UnixSocket(str(gyro))),
+        ):
+            yield guests
 
 
 @pytest.fixture(scope="module")
-def make(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Make:
-    """`make(2, replaced, by)`: the bundle of a release 2, with another word in the place of one boot argument."""
-    made = build.board_build(fleet.boards[inventory.robot(fleet, ROBOT).board], fleet.releases)
+def make(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Make]:
+    """`make(2)`: the bundle of release 2, `make(3, "panic")` of one with that fault, `more=` with further arguments.
 
-    def make(number: int, replaced: str = "", by: str = "") -> Path:
-        directory = tmp_path_factory.mktemp("release")
-        os.link(made.slot / "slot.img", directory / "slot.img")
-        header = json.loads((made.slot / "header.json").read_text()) | {"RELEASE": str(number)}
-        assert replaced in header["ARGUMENTS"].split() or not replaced
-        header["ARGUMENTS"] = " ".join(by if word == replaced else word for word in header["ARGUMENTS"].split())
-        (directory / "header.json").write_text(json.dumps(header))
-        bundle.pack(directory / "release.bundle", directory, fleet.releases, {}, 0)
-        return directory / "release.bundle"
+    Their content is another than that of the robots' cards: the station has the delta.
+    """
+    made = build.board_build(fleet.boards[inventory.robot(fleet, ROBOTS[0]).board], fleet.releases)
+    content = successor(made, fleet.releases, tmp_path_factory.mktemp("content"))
+    base = json.loads((made.slot / "header.json").read_text())["BLOB"]
+    file = release.delta_of(base, content.header["BLOB"])
+    file.parent.mkdir(parents=True, exist_ok=True)
+    delta.make(made.slot / "slot.img", content.directory / "slot.img", file)
 
-    return make
+    def make(number: int, fault: str = "", more: str = "") -> Path:
+        return content.release(number, tmp_path_factory.mktemp("release"), fault, more).bundle(fleet.releases)
+
+    yield make
+    file.unlink()
 
 
-def state(guests: Guests) -> dict[str, Any]:
-    shown: dict[str, Any] = json.loads(guests.sudo(NAME, "flotilla-slot show"))
+def state(guests: Guests, name: str = NAME) -> dict[str, Any]:
+    """Of the slots. The robot may be on its way back."""
+    guests.shells[name].connect(BOOT_SECONDS)
+    shown: dict[str, Any] = json.loads(guests.sudo(name, "flotilla-slot show"))
     return shown
 
 
-def runs(guests: Guests) -> tuple[str, str]:
+def runs(guests: Guests, name: str = NAME) -> tuple[str, str]:
     """Slot and release."""
-    now = state(guests)
+    now = state(guests, name)
     return now["running"], now["slots"][now["running"]]["release"]
+
+
+def boot_of(guests: Guests, name: str) -> str:
+    return guests.sudo(name, "cat /proc/sys/kernel/random/boot_id")
 
 
 def update(guests: Guests, release: Path, *more: str) -> Playbook:
     return guests.play("-e", f"bundle={release}", *more, playbook="update")
 
 
+def within_limit(guests: Guests, command: str, content: bytes) -> tuple[dict[str, Any], int]:
+    """What the updater says to a command, and the KiB that it took, all of it: by the kernel's account of a group.
+
+    The group has its processes, what the kernel keeps for them, and all pages of files that they were the first to
+    need, programs and libraries too: nothing is in memory beforehand. It gets no more than the limit, and no swap.
+    """
+    guests.shells[NAME].write("/tmp/input", content)
+    group = "/sys/fs/cgroup/updater"
+    updater = f"sh -c 'echo $$ >{group}/cgroup.procs && exec {UPDATER} {command}'"
+    script = f"""
+        sync
+        echo 3 >/proc/sys/vm/drop_caches
+        mkdir {group}
+        echo {MEMORY_KIB}K >{group}/memory.max
+        echo 0 >{group}/memory.swap.max
+        cat /tmp/input | {updater} || exit
+        cat {group}/memory.peak
+        grep oom_kill {group}/memory.events
+        rmdir {group}
+    """
+    said = guests.shells[NAME].script(script, timeout=SECONDS).stdout
+    told, peak, killed = said.strip().splitlines()[:3]
+    assert killed == "oom_kill 0", said
+    return json.loads(told), int(peak) >> 10
+
+
+def test_the_updater_fits_into_its_memory(
+    guests: Guests, make: Make, record_property: Callable[[str, object], None]
+) -> None:
+    """With a delta that is really applied, between two contents of 80 MB."""
+    offered = release.read(make(2))
+    told, peak = within_limit(guests, "begin", offered.offer)
+    peaks = {"begin": (told["memory_kib"], peak)}
+    assert len(told["missing"]) > 100
+    sent = release.delta_of(told["base"], offered.header["BLOB"]).read_bytes()
+    for command, content in (("delta", sent), ("finish", b"")):
+        told, peak = within_limit(guests, command, content)
+        peaks[command] = told["memory_kib"], peak
+    record_property(
+        PROPERTY, f"KiB of the updater's processes, and of their control group: {peaks}; a delta of {len(sent)} B"
+    )
+    assert (told["staged"], told["missing"]) == (True, [])
+    assert max(largest for largest, _ in peaks.values()) <= MEMORY_KIB
+    assert max(peak for _, peak in peaks.values()) < MEMORY_KIB, "it would have taken more"
+
+
 def test_a_release_is_brought_tried_and_kept(guests: Guests, make: Make) -> None:
     """With the word of the station, and back again when told so."""
     release = make(2)
-    staged = update(guests, release, "--tags", "stage")
+    staged = update(guests, release, "--tags", "stage", *ONE)
     assert staged.status == 0, staged.said
-    told = json.loads(guests.sudo(NAME, "/usr/lib/flotilla/update.py finish"))
-    assert (told["staged"], told["missing"]) == (True, [])
-    assert told["memory_kib"] <= MEMORY_KIB, f"the updater took {told['memory_kib']} KiB"
     assert runs(guests) == ("A", "1")
 
-    refused = update(guests, release)
+    refused = update(guests, release, *ONE)
     assert refused.status != 0
     assert "runs flotilla-task@" in refused.said
     assert (runs(guests), state(guests)["trial"]) == (("A", "1"), None)
 
     guests.sudo(NAME, "echo kept >/etc/of-release-1")
-    done = update(guests, release, *STOP)
+    done = update(guests, release, *STOP, *ONE)
     assert done.status == 0, done.said
     now = state(guests)
     assert (runs(guests), now["trial"], now["order"]) == (("B", "2"), None, ["B", "A"])
-    again = update(guests, release, *STOP)
+    again = update(guests, release, *STOP, *ONE)
     assert (again.status, runs(guests)) == (0, ("B", "2")), again.said
-    back = guests.play("-e", "go=back", *STOP, playbook="update")
+    back = guests.play("-e", "go=back", *STOP, *ONE, playbook="update")
     assert (back.status, runs(guests), state(guests)["order"]) == (0, ("A", "1"), ["A", "B"]), back.said
+
+
+def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
+    """It lacks the driver of a required sensor's port, which is good before and after. Both robots have it on their
+    cards then; the second one never starts it.
+
+    Seen to fail where the roll-out's last message does not name the sensor."""
+    guests.shells[NAME].script(GOOD, timeout=SECONDS)
+    before, boot = runs(guests), boot_of(guests, OTHER)
+    required = json.dumps({"health": {"overruns_percent": 100, "required_sensors": ["heading.gyro"]}})
+    done = update(guests, make(3, "dead sensor"), *STOP, "-e", required)
+    assert done.status != 0
+    assert f"{NAME} goes back to its release: {NAME} does not do well" in done.said, done.said
+    assert "heading.gyro: its flag is 0" in done.said, done.said
+    now = state(guests)
+    assert (runs(guests), now["trial"]) == (before, None)
+    guests.shells[NAME].script(GOOD, timeout=SECONDS)
+    other = state(guests, OTHER)
+    assert (boot_of(guests, OTHER), runs(guests, OTHER), other["trial"]) == (boot, ("A", "1"), None)
+    assert other["slots"]["B"]["release"] == "3", "it was not even brought there"
+    assert f"changed: [{OTHER}]" not in done.said.partition("Robots start it")[2]
 
 
 def test_a_release_that_does_not_start_goes_back(guests: Guests, make: Make) -> None:
     """Its first program is not there, so the kernel panics. What it changed below /etc is gone with it."""
     before = runs(guests)
-    done = update(guests, make(3, "init=/usr/lib/flotilla/preinit", "init=/nonexistent"), *STOP)
+    done = update(guests, make(4, "panic"), *STOP, *ONE)
     assert done.status != 0
     assert "the other one did not start" in done.said, done.said
     assert runs(guests) == before
@@ -105,12 +199,11 @@ def test_a_release_that_does_not_start_goes_back(guests: Guests, make: Make) -> 
 def test_a_release_that_nobody_reaches_goes_back(guests: Guests, make: Make) -> None:
     """It has no driver of its network, so nobody can tell it so."""
     before = runs(guests)
-    arguments = "module_blacklist=e100 flotilla.trial_s=10"
-    done = update(guests, make(4, "quiet", f"quiet {arguments}"), *STOP)
+    done = update(guests, make(5, "no network", "flotilla.trial_s=10"), *STOP, *ONE)
     assert done.status != 0
     assert "the other one did not start" in done.said, done.said
     assert runs(guests) == before
     assert state(guests)["slots"]["A" if before[0] == "B" else "B"]["ok"] is False
-    back = guests.play("-e", "go=back", *STOP, playbook="update")
+    back = guests.play("-e", "go=back", *STOP, *ONE, playbook="update")
     assert back.status != 0
     assert "there is nothing to go back to" in back.said, back.said

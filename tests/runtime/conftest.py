@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from images.builder import runtime
 from tests.runtime.tasks import HEADERS, PLUGIN, Tasks, compile_shared
 
 
@@ -20,6 +23,20 @@ def plugins(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("blocks")
     compile_shared(PLUGIN / "misbehave.c", directory / "misbehave.so", f"-I{HEADERS}")
     return directory
+
+
+@pytest.fixture
+def local_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This computer's compiler in place of the locked one; outputs in the test's directory."""
+
+    def command(work: Path, _: str, argv: Sequence[str], *_run: object) -> None:
+        argv = [word.replace("/out", str(work)) for word in argv]
+        done = subprocess.run(argv, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise UserError(done.stderr)
+
+    monkeypatch.setattr(runtime, "command", command)
+    monkeypatch.setattr(paths, "BUILD", tmp_path)
 
 
 @pytest.fixture

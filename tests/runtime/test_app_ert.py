@@ -9,7 +9,6 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -17,21 +16,11 @@ import pytest
 from flotilla.apps import ert, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from images.builder import runtime
 
 
 @pytest.fixture
-def generated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The sample's code, model `sample`, with this computer's compiler in place of the locked one."""
-
-    def command(work: Path, _: str, argv: Sequence[str], *_run: object) -> None:
-        argv = [word.replace("/out", str(work)) for word in argv]
-        done = subprocess.run(argv, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise UserError(done.stderr)
-
-    monkeypatch.setattr(runtime, "command", command)
-    monkeypatch.setattr(paths, "BUILD", tmp_path)
+def generated(local_compiler: None, tmp_path: Path) -> Path:
+    """The sample's code, model `sample`."""
     scaffold.create("ert", "sample", tmp_path)
     return tmp_path / "sample" / "generated"
 

@@ -8,13 +8,11 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from flotilla.apps import app, builder, ert
-from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
 from images.builder import runtime
@@ -49,17 +47,7 @@ def test_there_are_as_many_as_were_found_and_most_are_accepted() -> None:
 
 
 @pytest.fixture
-def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """With this computer's compiler in place of the locked one."""
-
-    def command(directory: Path, _: str, argv: Sequence[str], *_run: object) -> None:
-        argv = [word.replace("/out", str(directory)) for word in argv]
-        done = subprocess.run(argv, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise UserError(done.stderr)
-
-    monkeypatch.setattr(runtime, "command", command)
-    monkeypatch.setattr(paths, "BUILD", tmp_path)
+def work(local_compiler: None, tmp_path: Path) -> Path:
     return tmp_path
 
 

@@ -27,6 +27,23 @@ blocks:
   in: {{type: dds-subscribe, parameters: {parameters}}}
 """
 
+ROS_SENDER = """
+period: 10 ms
+priority: 0
+blocks:
+  out:
+    type: ros-publish
+    in: {{linear: [0.25, 0, 0], angular: [0, 0, -0.5]}}
+    parameters: {{type: geometry_msgs/msg/Twist, topic: cmd_vel, domain: {domain}}}
+"""
+
+ROS_RECEIVER = """
+period: 10 ms
+priority: 0
+blocks:
+  in: {{type: ros-subscribe, parameters: {{type: geometry_msgs/msg/Twist, topic: cmd_vel, domain: {domain}}}}}
+"""
+
 PARAMETERS = "{{type: wrench, topic: wrench, robot: 2, domain: {domain}, reliability: reliable{more}}}"
 
 DOMAIN = 1 + os.getpid() % 200
@@ -60,6 +77,17 @@ def test_a_topic_between_two_tasks(start: Start) -> None:
                 hearing.until(lambda row, heard=heard: row["sequence"] > heard + 20)
                 telling.signal(signal.SIGKILL)
                 hearing.until(lambda row: row["flag"] == 0)
+
+
+def test_a_message_of_ros_between_two_tasks(start: Start) -> None:
+    """test_ros.py has others at the other end."""
+    outputs = "in.linear,in.angular,in.flag"
+    with (
+        start("receiver", ROS_RECEIVER.format(domain=DOMAIN), outputs) as hearing,
+        start("sender", ROS_SENDER.format(domain=DOMAIN), "out.written"),
+    ):
+        row = hearing.until(lambda row: row["flag"] == 1)
+    assert (row["linear"], row["angular"]) == ([0.25, 0, 0], [0, 0, -0.5])
 
 
 def test_stacks_of_dds_are_small(start: Start) -> None:

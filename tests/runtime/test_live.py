@@ -128,7 +128,7 @@ def test_a_client_gets_what_was_sent(fleet: Path) -> None:
     robots = Robots(fleet)
     with station(fleet, "live", "0") as process:
         viewer = Viewer(port_of(process))
-        assert viewer.channels.keys() == {stream.topic for stream in robots.streams.values()}
+        assert viewer.channels.keys() == {stream.topic for stream in robots.streams.values()} | {f"{TOPIC}/pose"}
         begun = viewer.shown(lambda: send(robots))
         shown = watched(robots, viewer, 200, begun)
         check(shown, begun)
@@ -163,7 +163,7 @@ def test_slow_and_vanished_clients_disturb_nobody(fleet: Path, tmp_path: Path) -
             message.sequence for _, channel, message in make_reader(file).iter_messages() if channel.topic == TOPIC
         ]
     assert recorded == list(range(robots.sent["control"]))
-    assert f"a.mcap: {len(recorded)} messages" in said
+    assert f"a.mcap: {2 * len(recorded)} messages" in said, "each with a pose"
 
 
 def test_what_cannot_be_served_is_said(fleet: Path) -> None:

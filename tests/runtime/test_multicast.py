@@ -15,7 +15,7 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.updates import multicast
-from tests.runtime.radio import Radio
+from lab.qemu.radio import Radio
 
 STATION = "10.42.0.254"
 STRANGER = "10.42.0.99"

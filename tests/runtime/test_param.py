@@ -233,7 +233,7 @@ def test_a_wrong_request_is_answered(start: Start, request_: bytes) -> None:
         client.sendall(request_)
         assert client.makefile().read() == (
             "error\nunknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, "
-            "status json\n"
+            "status json, signals, watch SIGNAL...\n"
         )
 
 

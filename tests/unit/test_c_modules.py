@@ -22,7 +22,7 @@ MAY_INCLUDE = {
     "programs": {"include", "core", "executive", "programs"},
 }
 """Of each folder: what its files may include, from the runtime's root. `.` is the file's own folder."""
-GENERATED = {"flotilla.h"}
+GENERATED = {"flotilla.h", "ros.h"}
 """Headers that the build makes."""
 
 _INCLUDE = re.compile(r'^#include (?:"([^"]+)"|<(flotilla/[^>]+)>)', re.MULTILINE)

@@ -33,7 +33,7 @@ def test_a_result_is_made_once() -> None:
     assert (made / "file").exists()
 
 
-def test_a_failed_step_leaves_nothing_that_could_be_taken_for_a_result() -> None:
+def test_a_failed_step_leaves_nothing_that_could_be_taken_for_a_result(capsys: pytest.CaptureFixture[str]) -> None:
     def fail(out: Path) -> None:
         (out / "half").touch()
         raise RuntimeError("no")
@@ -41,6 +41,7 @@ def test_a_failed_step_leaves_nothing_that_could_be_taken_for_a_result() -> None
     with pytest.raises(RuntimeError):
         cache.result("kind", "0123456789abcdef", fail)
     assert list(paths.CACHE.glob("[!.]*")) == []
+    assert "kind-0123456789abcdef.part, which is not complete: 0." in capsys.readouterr().err
 
 
 def test_what_a_killed_build_left_is_removed_by_the_next() -> None:

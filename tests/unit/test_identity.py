@@ -16,7 +16,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity
 from flotilla.fleet.inventory import load_fleet
-from flotilla.fleet.model import Fleet, Ibss, IsaResources, Robot
+from flotilla.fleet.model import Device, Fleet, Ibss, IsaResources, Robot
 from flotilla.station import telemetry
 from flotilla.updates import multicast
 from images.builder import data_partition
@@ -154,6 +154,24 @@ def test_every_port_in_use_gets_its_name_and_baud_rate(fleet: Fleet) -> None:
         assert f'KERNEL=="{fleet.boards["smartcoret3"].ports[device.port].tty}"' in line
         assert f" {device.baud} raw" in line
     assert "setserial" not in rules
+
+
+def test_a_device_on_usb_is_known_by_who_it_is(fleet: Fleet) -> None:
+    """In whichever socket, and by its serial number where one is given."""
+    usb = {
+        "laser": Device(usb="15d1:0000", baud=115200),
+        "gps": Device(usb="0403:6001/A9XYZ", baud=4800),
+    }
+    robot = fleet.robots[1].model_copy(update={"devices": usb})
+    rules = _text(fleet, robot, "/etc/udev/rules.d/70-robot.rules").splitlines()
+    laser, gps = (next(line for line in rules if f'SYMLINK+="robot/{name}"' in line) for name in usb)
+    for line, vendor, product in (laser, "15d1", "0000"), (gps, "0403", "6001"):
+        assert line.startswith('SUBSYSTEM=="tty", SUBSYSTEMS=="usb", ')
+        assert f'ATTRS{{idVendor}}=="{vendor}", ATTRS{{idProduct}}=="{product}", ' in line
+        assert "KERNEL==" not in line
+    assert "ATTRS{serial}" not in laser
+    assert 'ATTRS{serial}=="A9XYZ", ' in gps
+    assert "/bin/stty -F /dev/%k 4800 raw" in gps
 
 
 def test_a_port_with_jumpers_is_declared_before_it_is_used(fleet: Fleet) -> None:

@@ -57,7 +57,7 @@ CASES = {
         ROBOTS, "10.42.0.254", "10.42.0.1", "station.address", "is robot1's address…10.42.0.5"
     ),
     "copied without a new name": Case(
-        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 62…another name"
+        ROBOTS, ROBOT4, ROBOT4 + "        " + ROBOT4, "robot4", "stands twice, first in line 65…another name"
     ),
     # One robot
     "number 0": Case(ROBOTS, "number: 4", "number: 0", "robot4.number", "out of range…1 to 250"),
@@ -131,6 +131,38 @@ CASES = {
         "x86_64 has no such port…free are COM2",
     ),
     "console's port": Case(ROBOTS, "COM6", "COM1", "robot1.devices.magnetometer.port", "console's port (ttyS0)…COM2"),
+    "port and usb": Case(
+        ROBOTS,
+        "port: COM6",
+        "port: COM6\n              usb: '0403:6001'",
+        "robot1.devices.magnetometer",
+        "both at a port and on USB…either port",
+    ),
+    "neither port nor usb": Case(
+        ROBOTS,
+        "              port: COM6\n",
+        "",
+        "robot1.devices.magnetometer",
+        "port is missing…either port",
+    ),
+    "usb": Case(
+        ROBOTS,
+        "port: COM6",
+        "usb: Hokuyo",
+        "robot1.devices.magnetometer.usb",
+        "is not who a USB…15d1:0000",
+        "Hokuyo",
+        also=1,
+    ),
+    "usb twice": Case(
+        ROBOTS,
+        "              port: COM6\n              baud: 9600\n            battery: # OceanServer battery controller\n"
+        "              port: COM7",
+        "              usb: '0403:6001/A1'\n              baud: 9600\n            battery:\n"
+        "              usb: '0403:6001'",
+        "robot1.devices.magnetometer.usb",
+        "is also battery's…serial number",
+    ),
     "unusual baud": Case(
         ROBOTS, "baud: 9600", "baud: 9601", "robot1.devices.magnetometer.baud", "standard…9600, 19200"
     ),
@@ -144,7 +176,7 @@ CASES = {
         ROBOTS, PORT3, PORT3.replace("port:", "prot:"), "robot3.devices.gyro.prot", "not known…mean port?", also=1
     ),
     "no such task": Case(
-        ROBOTS, "[heading]", "[haeding]", "robot1.control_tasks.0", "no file…one of control, heading", "haeding"
+        ROBOTS, "[heading]", "[haeding]", "robot1.control_tasks.0", "no file…one of control…heading", "haeding"
     ),
     "overruns by the thousand": Case(
         ALL, "overruns_percent: 1", "overruns_percent: 1000", "health.overruns_percent", "out of range…0 to 100"

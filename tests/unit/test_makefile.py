@@ -38,7 +38,9 @@ GIVEN = {
     "record": ["PORT", "SECONDS", "ADDRESS"],
     "live": ["OUT", "SECONDS"],
     "top": ["OUT", "PORT"],
+    "report": ["FILE", "OUT"],
     "param": ["ROBOT", "TASK", "PARAM", "VALUE"],
+    "scope": ["ROBOT", "TASK", "EVERY", "ROWS", "TRIGGER", "BEFORE", "CSV"],
     "latency": ["BOARD", "KERNEL", "PLAN", "TARGET"],
     "latency-accept": ["BOARD", "KERNEL", "PLAN"],
     "boot-time": ["BOARD"],
@@ -99,3 +101,26 @@ def test_paths_that_a_shell_would_read_are_refused(name: str, value: str) -> Non
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert f"{name}={value}: is a path with blanks or with a character that means something" in done.stderr
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_an_environment_that_cannot_be_made_leaves_the_last_one(tmp_path: Path, interrupted: bool) -> None:
+    """Seen to fail: without network, a changed lock removed the environment, and nothing came in its place."""
+    last, programs = tmp_path / "build/venv", tmp_path / "programs"
+    for directory in (last, programs):
+        directory.mkdir(parents=True)
+    (last / "marker").touch()
+    (last / ".complete").touch()
+    os.utime(last / ".complete", (0, 0))  # older than the locks
+    half = f"#!/bin/sh\nmkdir {last}\n"
+    (programs / "python3").write_text(half + ("kill -INT $PPID" if interrupted else "exit 1"))
+    (programs / "python3").chmod(0o755)
+    environment = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}
+    done = subprocess.run(
+        ["make", "-C", str(paths.PROJECT), f"BUILD={tmp_path / 'build'}", f"{last}/.complete"],
+        env=environment | {"PATH": f"{programs}:{os.environ['PATH']}"}, capture_output=True, text=True, timeout=60,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode != 0
+    assert sorted(path.name for path in last.iterdir()) == [".complete", "marker"], done.stderr
+    assert not last.with_name("venv.before").exists()

@@ -73,7 +73,7 @@ CASES = {
         "    gyro: {", "    igps: { type: boolean }\n    gyro: {", "sensors.signals.igps", "stands twice", "igps",
     ),
     "no such sender": Case(
-        "sender: navigation", "sender: stars", "state.sender", "no file…stars.yml…one of control, heading", "stars",
+        "sender: navigation", "sender: stars", "state.sender", "no file…stars.yml…one of control…heading", "stars",
     ),
     "stations send": Case("sender: navigation", "sender: stations", "state.sender", "no file…one of", "stations"),
     "no such receiver": Case(
@@ -109,9 +109,19 @@ CASES = {
     "charge that is not there": Case(
         "rate_hz: 10\n", "rate_hz: 10\n  charge: soc\n", "control-report.charge", "not a signal of", "soc", "soc",
     ),
+    "drawing of a message between tasks": Case(
+        "  standby: true", "  foxglove: { pose: { type: PoseInFrame } }", "wrench.foxglove", "no use for", "foxglove",
+    ),
+    "drawing that is none": Case(
+        "PoseInFrame", "PoseInTime", "control-report.foxglove.pose.type", "no schema of Foxglove…such as", "PoseInTime",
+    ),
+    "drawing of what is not there": Case(
+        "estimated[2]", "estimate[2]", "control-report.foxglove.pose.signals.pose.orientation",
+        "not a signal of this message…one of step", "estimate[2]",
+    ),
     "no signals": Case(
         "    flying: { type: boolean }\n    done: { type: boolean }\n",
-        "heartbeat-idle: { sender: heartbeat, receiver: stations, port: 5022, rate_hz: 1, every: 100, signals: {} }\n",
+        "heartbeat-idle: { sender: heartbeat, receiver: stations, port: 5040, rate_hz: 1, every: 100, signals: {} }\n",
         "heartbeat-idle.signals", "there are none…at least one", "heartbeat-idle",
     ),
     "too long": Case(
@@ -345,4 +355,4 @@ def test_every_type_of_signal_can_be_recorded(tasks: Path) -> None:
     (stream,) = [stream for stream in telemetry.streams(virtual.fleet("udp")) if stream.name == "all"]
     assert stream.length == 3 * (1 + 1 + 1 + 2 + 2 + 4 + 4 + 8 + 8 + 4 + 8)
     assert [field.offset for field in stream.fields] == [0, 3, 6, 9, 15, 21, 33, 45, 69, 93, 105]
-    assert Schema(stream).encode(stream.unpack(bytes(stream.length)))
+    assert Schema(stream).encode(stream.unpack(bytes(stream.length)), 0)

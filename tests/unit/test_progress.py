@@ -164,14 +164,40 @@ def test_a_log_has_quarters_of_what_has_no_parts(clock: Clock, log: Callable[[],
     ]
 
 
-def test_what_work_says_itself_is_said_once(clock: Clock, log: Callable[[], list[str]]) -> None:
-    said = "runtime: 12.0 s\n"
-    with progress.step("verify", lambda: verify.far(said)) as step:
+def test_lines_of_work_that_shows_progress_itself_come_once(clock: Clock, log: Callable[[], list[str]]) -> None:
+    written = ""
+    with progress.step("verify", lambda: verify.far(written, own_kernel=False)) as step:
         step.tick()
-        step.tick()
-        said += "unfinished\nkernel: 3.0 s\n"
-        step.tick()
-    assert log() == ["verify: runtime: 12.0 s", "verify: kernel: 3.0 s", "verify: 0.0 s"]
+        for line in (
+            "unpack 89 build tools: 10.0 s",
+            "unfinished",
+            "runtime for i386: 50 % of 190 files after 0:31; about 0:25 left",
+            "runtime for i386: 56.0 s",
+            "root file system of x (178 packages): kernel: 6.1 s; about 0:38 left",
+        ):
+            clock.wait(20)
+            written += f"{line}\n"
+            step.tick()
+            step.tick()
+    assert log() == [
+        "verify: unpack 89 build tools: 10.0 s; about 2:28 left",
+        "verify: runtime for i386: 50 % of 190 files after 0:31; about 3:00 left",
+        "verify: runtime for i386: 56.0 s; about 2:10 left",
+        "verify: root file system of x (178 packages): kernel: 6.1 s; about 1:50 left",
+        "verify: 100.0 s",
+    ]
+
+
+def test_a_second_image_shows_how_far_it_is(clock: Clock, picture: Callable[[progress.Step], str]) -> None:
+    """Seen to fail: it showed the last part that had ended, and not how long the rest takes."""
+    written = "unpack 89 build tools: 10.0 s\n"
+    with progress.step("second image", lambda: verify.far(written, own_kernel=False)) as step:
+        assert "build tools: 10.0 s, 11 %, 0:00" in picture(step)
+        clock.wait(60)
+        written += "runtime for i386: 56.0 s\n"
+        assert "i386: 56.0 s, 38 %, 1:00, about 2:22 left" in picture(step)
+        written += "root file system of x (178 packages): 101.0 s\n"
+        assert "100 %" in picture(step)
 
 
 # As a process

@@ -285,6 +285,7 @@ def test_a_missing_key_is_named(own: Path, merged: dict[str, Any], place: tuple[
     ("place", "value", "said"),
     [
         ("architecture", "arm64", "arm64: is not known; one of 'i386' or 'amd64'"),
+        ("processor", "Pentium III", "Pentium III: is not a value of GCC's -march; such as pentium3, see `man gcc`"),
         ("kernel", "vanilla", "vanilla: is not known; one of 'debian' or 'lean'"),
         ("kernels", "lean", "lean: is not known; did you mean kernel?"),
         ("kernel_arguments", ["two words", "8250.nr_uarts=6"], "two words: contains blanks or nothing; one word"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from images.builder import tools
+from flotilla.fleet import inventory
+from images.builder import toolchain, tools
 from images.builder.lock import Lock, Package, Suite
 
 
@@ -29,3 +31,22 @@ def test_tree_of_a_changed_package_is_refused(tmp_path: Path, monkeypatch: pytes
     (paths.POOL / f"{right}.deb").write_bytes(b"right")  # passes the hashes, and fails only as no Debian package
     with pytest.raises(UserError, match="cannot unpack tool"):
         tools.tree(lock)
+
+
+@pytest.mark.parametrize(("processor", "compiled_for"), [("pentium3", "pentium3"), (None, "i686")])
+def test_a_program_is_compiled_for_the_boards_processor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, processor: str | None, compiled_for: str
+) -> None:
+    """Seen to fail: each i386 board got programs for a Pentium III."""
+    compiled: list[str] = []
+
+    def run(_: str, work: Path, command: Sequence[str], _log: Path) -> None:
+        compiled.extend(command)
+        (work / "made").write_bytes(b"program")
+
+    monkeypatch.setattr(toolchain, "run", run)
+    monkeypatch.setattr(paths, "BUILD", tmp_path)
+    (tmp_path / "program.c").touch()
+    board = inventory.load_fleet().boards["smartcoret3"].model_copy(update={"processor": processor})
+    assert toolchain.compile_static(tmp_path / "program.c", board) == b"program"
+    assert [word for word in compiled if word.startswith("-march=")][-1] == f"-march={compiled_for}"

@@ -85,14 +85,15 @@ struct odometry {
 enum { LEFT, RIGHT, RESET };
 enum { V, OMEGA, X, Y, HEADING };
 
-static const struct fl_parameter odometry_parameters[] = {
-    FL_PARAMETER(struct odometry, radius, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "of the wheels"),
-    FL_PARAMETER(struct odometry, track, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "from wheel to wheel"),
-    FL_PARAMETER(struct odometry, x, .default_value = "0", .unit = "m", .summary = "at time zero and after a reset"),
-    FL_PARAMETER(struct odometry, y, .default_value = "0", .unit = "m", .summary = "at time zero and after a reset"),
-    FL_PARAMETER(struct odometry, heading, .default_value = "0", .unit = "rad",
-                 .summary = "at time zero and after a reset; from x to y"),
-};
+#define ODOMETRY_PARAMETERS(type)                                                                                      \
+    FL_PARAMETER(type, radius, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "of the wheels"),                      \
+        FL_PARAMETER(type, track, .min = 1e-6, .max = 1e3, .unit = "m", .summary = "from wheel to wheel"),             \
+        FL_PARAMETER(type, x, .default_value = "0", .unit = "m", .summary = "at time zero and after a reset"),         \
+        FL_PARAMETER(type, y, .default_value = "0", .unit = "m", .summary = "at time zero and after a reset"),         \
+        FL_PARAMETER(type, heading, .default_value = "0", .unit = "rad",                                               \
+                     .summary = "at time zero and after a reset; from x to y")
+
+static const struct fl_parameter odometry_parameters[] = {ODOMETRY_PARAMETERS(struct odometry)};
 
 static const struct fl_port odometry_inputs[] = {
     {.name = "left", .type = FL_DOUBLE, .width = 1, .unit = "rad/s", .summary = "wheel, since the step before"},
@@ -108,29 +109,26 @@ static const struct fl_port odometry_outputs[] = {
     {.name = "heading", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "beyond a full turn too"},
 };
 
+static void place(struct fl_block *block, double x, double y, double heading)
+{
+    FL_OUT(block, V, double) = 0;
+    FL_OUT(block, OMEGA, double) = 0;
+    FL_OUT(block, X, double) = x;
+    FL_OUT(block, Y, double) = y;
+    FL_OUT(block, HEADING, double) = heading;
+}
+
 static int initialize_odometry(struct fl_block *block)
 {
     const struct odometry *odometry = block->parameters;
-    FL_OUT(block, V, double) = 0;
-    FL_OUT(block, OMEGA, double) = 0;
-    FL_OUT(block, X, double) = odometry->x;
-    FL_OUT(block, Y, double) = odometry->y;
-    FL_OUT(block, HEADING, double) = odometry->heading;
+    place(block, odometry->x, odometry->y, odometry->heading);
     return FL_OK;
 }
 
-static int step_odometry(struct fl_block *block)
+/* An arc's chord is its length times sin(a)/a of half its angle, and points halfway between the two headings: exact
+ * while the wheels' speeds are constant between two steps. */
+static void roll(struct fl_block *block, double v, double omega, double h)
 {
-    const struct odometry *odometry = block->parameters;
-    double left = FL_IN(block, LEFT, double), right = FL_IN(block, RIGHT, double);
-    double v = odometry->radius * (right + left) / 2, omega = odometry->radius * (right - left) / odometry->track;
-    double h = fl_interval_s(block);
-    if (FL_IN(block, RESET, uint8_t))
-        return initialize_odometry(block);
-    if (!isfinite(v) || !isfinite(omega))
-        v = omega = 0;
-    /* An arc's chord is its length times sin(a)/a of half its angle, and points halfway between the two headings:
-     * exact while the wheels' speeds are constant between two steps. */
     double half = omega * h / 2, chord = v * h * (half < -1e-8 || half > 1e-8 ? sin(half) / half : 1);
     double middle = FL_OUT(block, HEADING, double) + half;
     FL_OUT(block, V, double) = v;
@@ -138,6 +136,18 @@ static int step_odometry(struct fl_block *block)
     FL_OUT(block, X, double) += chord * cos(middle);
     FL_OUT(block, Y, double) += chord * sin(middle);
     FL_OUT(block, HEADING, double) += omega * h;
+}
+
+static int step_odometry(struct fl_block *block)
+{
+    const struct odometry *odometry = block->parameters;
+    double left = FL_IN(block, LEFT, double), right = FL_IN(block, RIGHT, double);
+    double v = odometry->radius * (right + left) / 2, omega = odometry->radius * (right - left) / odometry->track;
+    if (FL_IN(block, RESET, uint8_t))
+        return initialize_odometry(block);
+    if (!isfinite(v) || !isfinite(omega))
+        v = omega = 0;
+    roll(block, v, omega, fl_interval_s(block));
     return FL_OK;
 }
 
@@ -152,4 +162,97 @@ FL_BLOCK(differential_odometry) = {
     .parameters_size = sizeof(struct odometry),
     .initialize = initialize_odometry,
     .step = step_odometry,
+};
+
+/** encoder-odometry
+ *
+ * Computes motion and pose of a robot from the angles of its two driven wheels on one axle, so that no motion is lost
+ * between two steps. The first good angles are where it begins.
+ *
+ * Equations:
+ *   wheels' speeds: what the angles changed by since the step before, in the time since then
+ *   all else as differential-odometry
+ *
+ * Failure: While the flag is 0, or an angle is not finite, `v` and `omega` are 0 and the pose stays; the next good
+ * angles are a new beginning. Angles that changed faster than `fastest` are one, too: an encoder that counts from zero
+ * again. `lost` counts such beginnings, each of which may have lost motion.
+ */
+struct encoders {
+    double radius, track, x, y, heading, fastest;
+};
+
+struct angles {
+    double left, right;
+    bool known, begun;
+};
+
+static const struct fl_parameter encoder_parameters[] = {
+    ODOMETRY_PARAMETERS(struct encoders),
+    FL_PARAMETER(struct encoders, fastest, .min = 1e-3, .max = 1e6, .unit = "rad/s",
+                 .summary = "that a wheel can turn: a faster change of its angle is none of the robot's motion"),
+};
+
+enum { GOOD = RESET, ENCODER_RESET };
+static const struct fl_port encoder_inputs[] = {
+    {.name = "left", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "angle of the wheel"},
+    {.name = "right", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "angle of the wheel"},
+    {.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: both angles are good"},
+    {.name = "reset", .type = FL_BOOLEAN, .width = 1, .flags = FL_OPTIONAL, .summary = "1: back to the pose at start"},
+};
+
+enum { LOST = HEADING + 1 };
+static const struct fl_port encoder_outputs[] = {
+    {.name = "v", .type = FL_DOUBLE, .width = 1, .unit = "m/s", .summary = "speed; zero where it is not known"},
+    {.name = "omega", .type = FL_DOUBLE, .width = 1, .unit = "rad/s", .summary = "rate of turn, anticlockwise"},
+    {.name = "x", .type = FL_DOUBLE, .width = 1, .unit = "m", .summary = "of the axle's middle"},
+    {.name = "y", .type = FL_DOUBLE, .width = 1, .unit = "m", .summary = "of the axle's middle"},
+    {.name = "heading", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "beyond a full turn too"},
+    {.name = "lost", .type = FL_UINT32, .width = 1, .summary = "beginnings after the first one"},
+};
+
+static int initialize_encoders(struct fl_block *block)
+{
+    const struct encoders *set = block->parameters;
+    struct angles *angles = block->state;
+    place(block, set->x, set->y, set->heading);
+    angles->known = false;
+    return FL_OK;
+}
+
+static int step_encoders(struct fl_block *block)
+{
+    const struct encoders *set = block->parameters;
+    struct angles *angles = block->state, before = *angles;
+    double left = FL_IN(block, LEFT, double), right = FL_IN(block, RIGHT, double), h = fl_interval_s(block);
+    double fast = fmax(fabs(left - before.left), fabs(right - before.right));
+    bool good = FL_IN(block, GOOD, uint8_t) && isfinite(left) && isfinite(right);
+    bool moved = good && before.known && fast <= set->fastest * h && h > 0;
+    if (good && before.begun && !moved && (!before.known || h > 0))
+        FL_OUT(block, LOST, uint32_t)++;
+    if (good && (h > 0 || !before.known))
+        *angles = (struct angles){left, right, true, true};
+    else if (!good)
+        angles->known = false;
+    if (FL_IN(block, ENCODER_RESET, uint8_t))
+        place(block, set->x, set->y, set->heading);
+    else if (moved)
+        roll(block, set->radius * (right - before.right + left - before.left) / (2 * h),
+             set->radius * (right - before.right - left + before.left) / (set->track * h), h);
+    else
+        roll(block, 0, 0, h);
+    return FL_OK;
+}
+
+FL_BLOCK(encoder_odometry) = {
+    .abi = FL_ABI,
+    .name = "encoder-odometry",
+    .summary = "motion and pose of a robot from the angles of its two wheels",
+    .source = source,
+    FL_TABLE(input, encoder_inputs),
+    FL_TABLE(output, encoder_outputs),
+    FL_TABLE(parameter, encoder_parameters),
+    .parameters_size = sizeof(struct encoders),
+    .state_size = sizeof(struct angles),
+    .initialize = initialize_encoders,
+    .step = step_encoders,
 };

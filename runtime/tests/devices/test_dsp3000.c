@@ -357,7 +357,10 @@ static void makes_sure_of_the_mode(void **state)
     unsigned received = 0;
     testbed_begin(gyro);
     fcntl(line.master, F_SETFL, O_NONBLOCK);
-    STEP_UNTIL(gyro, (say_in_its_mode(&line, &received, REPEATS - 1), poll(NULL, 0, 5), flag(gyro)));
+    /* Each line waits for the command before it, or a driver that is late would find lines of the mode before. */
+    struct pollfd command = {.fd = line.master, .events = POLLIN};
+    STEP_UNTIL(gyro, (say_in_its_mode(&line, &received, REPEATS - 1), poll(&command, 1, received < REPEATS ? 1000 : 5),
+                      flag(gyro)));
     assert_near(GET(gyro, "rate", double), 0, 0);
     /* Whatever changes it later: a short loss of power that no silence shows, or more misses than that. */
     STEP_UNTIL(gyro, (say_in_its_mode(&line, &received, UINT_MAX), GET(gyro, "rate", double) != 0));
@@ -477,6 +480,15 @@ static void counts_each_increment_once(void **state)
     line_unplug(&line);
 }
 
+/* How often Z came since the last look. After a silence, which a busy computer makes, the mode comes in between. */
+static int zeros_of(const struct line *line)
+{
+    int zeros = 0;
+    for (char command; read(line->master, &command, 1) == 1;)
+        zeros += command == 'Z';
+    return zeros;
+}
+
 static void zeroes_the_angle(void **state)
 {
     (void)state;
@@ -488,18 +500,17 @@ static void zeroes_the_angle(void **state)
     assert_near(GET(gyro, "angle", double), -90 * DEGREE, 1e-12);
     SET(gyro, "zero", bool, true);
     steps_under_seccomp(gyro, 3);
+    fcntl(line.master, F_SETFL, O_NONBLOCK);
+    int zeros = 0;
+    STEP_UNTIL(gyro, (line_say(&line, "     270.000000   1\r\n"), (zeros += zeros_of(&line)) >= 3));
+    /* It stays 1, and was sent three times, not more. */
     uint32_t before = GET(gyro, "sequence", uint32_t);
     STEP_UNTIL(gyro, (line_say(&line, "     270.000000   1\r\n"), GET(gyro, "sequence", uint32_t) > before + 10));
-    line_say(&line, "       0.000000   1\r\n");
-    STEP_UNTIL(gyro, fabs(GET(gyro, "angle", double)) < 1e-12);
+    /* Again and again: the first lines after a silence do not count. */
+    STEP_UNTIL(gyro, (line_say(&line, "       0.000000   1\r\n"), fabs(GET(gyro, "angle", double)) < 1e-12));
     SET(gyro, "zero", bool, false);
     assert_int_equal(line_step(gyro), FL_OK);
-    char received[256] = "";
-    assert_true(line_receives(&line, "ZZZ"));
-    /* It stayed 1, and was sent three times, not more. */
-    fcntl(line.master, F_SETFL, O_NONBLOCK);
-    (void)!read(line.master, received, sizeof received - 1);
-    assert_null(strchr(received, 'Z'));
+    assert_int_equal(zeros + zeros_of(&line), 3);
     testbed_end(gyro);
     line_unplug(&line);
 }

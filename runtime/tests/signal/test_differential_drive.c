@@ -117,6 +117,74 @@ static void keeps_its_pose_in_late_steps(void **state)
     testbed_end(odometry);
 }
 
+/* Angles of two wheels; radius 0.1 m, track 0.4 m. */
+static void turn_to(struct fl_block *block, double left, double right, uint8_t flag)
+{
+    SET(block, "left", double, left);
+    SET(block, "right", double, right);
+    SET(block, "flag", uint8_t, flag);
+    assert_int_equal(testbed_step(block), FL_OK);
+}
+
+static struct fl_block *encoders(void)
+{
+    struct fl_block *block =
+        testbed_block("encoder-odometry", "radius", "0.1", "track", "0.4", "fastest", "20", "y", "2", NULL);
+    testbed_begin(block);
+    return block;
+}
+
+static void counts_angles(void **state)
+{
+    (void)state;
+    struct fl_block *block = encoders();
+    turn_to(block, 70, -30, 1); /* where they happen to be */
+    assert_near(GET(block, "v", double), 0, 0);
+    for (int i = 1; i <= 1000; i++)
+        turn_to(block, 70 + 0.02 * i, -30 + 0.04 * i, 1); /* 0.3 m/s, 0.5 rad/s: a circle of 0.6 m */
+    assert_near(GET(block, "v", double), 0.3, 1e-9);
+    assert_near(GET(block, "omega", double), 0.5, 1e-9);
+    assert_near(GET(block, "heading", double), 5, 1e-9);
+    assert_near(GET(block, "x", double), 0.6 * sin(5), 1e-9);
+    assert_near(GET(block, "y", double), 2 + 0.6 * (1 - cos(5)), 1e-9);
+    assert_int_equal(GET(block, "lost", uint32_t), 0);
+    SET(block, "reset", uint8_t, 1);
+    turn_to(block, 90.02, 10.04, 1);
+    assert_near(GET(block, "x", double), 0, 0);
+    assert_near(GET(block, "y", double), 2, 0);
+    SET(block, "reset", uint8_t, 0);
+    turn_to(block, 90.12, 10.14, 1); /* since the step of the reset */
+    assert_near(GET(block, "x", double), 0.01, 1e-12);
+    testbed_end(block);
+}
+
+static void begins_anew(void **state)
+{
+    (void)state;
+    struct fl_block *block = encoders();
+    turn_to(block, 5, 5, 0);
+    turn_to(block, 5, 5, 1);
+    turn_to(block, 5.1, 5.1, 1);
+    assert_near(GET(block, "x", double), 0.01, 1e-12);
+    assert_int_equal(GET(block, "lost", uint32_t), 0);
+    turn_to(block, 0, 5.1, 1); /* the left drive counts from zero again */
+    assert_near(GET(block, "v", double), 0, 0);
+    assert_near(GET(block, "x", double), 0.01, 1e-12);
+    assert_int_equal(GET(block, "lost", uint32_t), 1);
+    turn_to(block, 0.1, 5.2, 1);
+    assert_near(GET(block, "x", double), 0.02, 1e-12);
+    turn_to(block, 0.2, 5.3, 0);
+    turn_to(block, 0.2, NAN, 1);
+    assert_near(GET(block, "v", double), 0, 0);
+    assert_near(GET(block, "x", double), 0.02, 1e-12);
+    assert_int_equal(GET(block, "lost", uint32_t), 1);
+    turn_to(block, 0.3, 5.4, 1);
+    turn_to(block, 0.4, 5.5, 1);
+    assert_near(GET(block, "x", double), 0.03, 1e-12);
+    assert_int_equal(GET(block, "lost", uint32_t), 2);
+    testbed_end(block);
+}
+
 static void refuses(void **state)
 {
     (void)state;
@@ -132,6 +200,8 @@ int main(void)
         cmocka_unit_test(drives_a_circle),
         cmocka_unit_test(keeps_its_pose),
         cmocka_unit_test(keeps_its_pose_in_late_steps),
+        cmocka_unit_test(counts_angles),
+        cmocka_unit_test(begins_anew),
         cmocka_unit_test(refuses),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -22,6 +22,7 @@ static void compute(void **state)
     steps(testbed_block("delay", NULL));
     steps(testbed_block("differential-drive", "radius", "0.1", "track", "0.4", NULL));
     steps(testbed_block("differential-odometry", "radius", "0.1", "track", "0.4", NULL));
+    steps(testbed_block("angles-to-quaternion", NULL));
     steps(testbed_block("gain", NULL));
     steps(testbed_block("integrator", NULL));
     steps(testbed_block("join", NULL));
@@ -30,6 +31,7 @@ static void compute(void **state)
     steps(testbed_block("low-pass", "time_constant", "1", NULL));
     steps(testbed_block("pack", "types", "double", NULL));
     steps(testbed_block("pid", "kp", "1", "min", "-1", "max", "1", NULL));
+    steps(testbed_block("quaternion-to-angles", NULL));
     steps(testbed_block("rotate", NULL));
     steps(testbed_block("schmitt-trigger", "on", "1", "off", "0", NULL));
     steps(testbed_block("select", NULL));

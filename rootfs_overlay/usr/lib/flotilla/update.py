@@ -1,4 +1,4 @@
-#!/usr/bin/python3
+#!/usr/bin/python3 -IS
 """Brings a release into the slot that does not run: checks it, writes it, reads it back. One command at a time.
 
   begin     standard input: {"manifest": TEXT, "signatures": [TEXT, ...]}; the release is taken if it is signed as the
@@ -7,33 +7,38 @@
   copy      take what the running release has in the same place
   write     standard input: chunks, each behind its number and length (two unsigned 32-bit numbers, little-endian)
   delta     standard input: a delta from the running release's content, as flotilla-patch reads it
-  finish    read all back from the card, and write the header: from now on the slot holds the release
+  finish    read all back from the card, and write the header: from now on the slot holds the release; remove the spool
+            of /usr/lib/flotilla/receive
   activate  try it at the next start; the layer above /etc begins as a copy of the running release's
 
 Each prints one object of JSON: `release`, `slot`, `base` (SHA-256 of the running release's content), `running` (the
 release runs already), `staged` (the slot holds it), `missing` (numbers of chunks that the slot does not hold yet),
-`chunk_bytes`, `memory_kib` (the peak so far). Whatever is cut off, by power or by the radio, begins again with `begin`,
-and goes on where it was. Status 1: refused, with the reason on standard error.
+`chunk_bytes`, `memory_kib` (the peak so far, with that of flotilla-patch). Whatever is cut off, by power or by the
+radio, begins again with `begin`, and goes on where it was. Status 1: refused, with the reason on standard error.
 
 The header is cleared before anything else of the slot is written, and written when all of it is on the card
 (images/builder/slot.py). Reads and writes go past the page cache, which belongs to the control tasks. What this module
-imports counts as memory on a robot, so it does without tempfile, shutil, pathlib and ctypes.
+imports counts as memory on a robot, of which an update may take 16 MB (docs/decisions/0055-updater-within-16-mb.md).
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import mmap
 import os
 import struct
-import subprocess
 import sys
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # without an import: it takes time
     from collections.abc import Iterator
+    from hashlib import sha256
     from typing import Any, BinaryIO
+else:
+    try:
+        from _sha256 import sha256  # Python's own: hashlib loads OpenSSL's library, which takes 3 MB
+    except ImportError:  # Python 3.12 and later
+        from hashlib import sha256
 
 KNOWN = "/data/update"
 RUN = "/run"
@@ -44,6 +49,7 @@ SIGNATURE = b"# GRUB Environment Block\n"
 HEADER_ROOM, HEADER_BYTES = 4096, 1024
 SECTOR = 512
 LARGEST_CHUNK = 1 << 18
+SIGKILL = 9  # without `signal`, which takes a quarter of a MB
 
 
 class Refused(Exception):
@@ -52,10 +58,51 @@ class Refused(Exception):
 
 def slots() -> dict[str, Any]:
     """What flotilla-slot says."""
-    found: dict[str, Any] = json.loads(
-        subprocess.run(["flotilla-slot", "show"], check=True, stdout=subprocess.PIPE).stdout
-    )
+    fd, pid = piped("flotilla-slot", "show")
+    with open(fd, "rb") as shown:
+        text = shown.read()
+    check("flotilla-slot show", ended(pid))
+    found: dict[str, Any] = json.loads(text)
     return found
+
+
+# Programs are started without `subprocess`, whose import takes 0.7 MB.
+
+
+def start(*argv: str, out: int | None = None, given: str = "", quiet: bool = False) -> int:
+    """Start a program; its number. `out`: where its standard output goes. `given`: the file that it reads."""
+    actions: list[tuple[Any, ...]] = []
+    if given:
+        actions.append((os.POSIX_SPAWN_OPEN, 0, given, os.O_RDONLY, 0))
+    if out is not None:
+        actions.append((os.POSIX_SPAWN_DUP2, out, 1))
+    if quiet:
+        actions += [(os.POSIX_SPAWN_OPEN, number, os.devnull, os.O_WRONLY, 0) for number in (1, 2)]
+    return os.posix_spawnp(argv[0], argv, os.environ, file_actions=actions)
+
+
+def piped(*argv: str) -> tuple[int, int]:
+    """Start a program whose standard output can be read: from where, and its number."""
+    read, write = os.pipe()
+    try:
+        return read, start(*argv, out=write)
+    finally:
+        os.close(write)
+
+
+def ended(pid: int) -> int:
+    """The exit status of a program, when it has ended; negative where a signal ended it."""
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def check(what: str, status: int) -> None:
+    if status:
+        raise Refused(f"{what} failed (status {status})")
+
+
+def run(*argv: str) -> None:
+    """Run a program, which must not fail."""
+    check(" ".join(argv), ended(start(*argv)))
 
 
 class Slot:
@@ -152,14 +199,14 @@ class Release:
     def holds(self, number: int) -> bool:
         """Whether the slot has this chunk."""
         content = self.slot.read(number * self.chunk_bytes, self.length(number))
-        return hashlib.sha256(content).hexdigest() == self.chunks[number]
+        return sha256(content).hexdigest() == self.chunks[number]
 
     def missing(self) -> list[int]:
         return [number for number in range(len(self.chunks)) if not self.holds(number)]
 
     def take(self, number: int, content: bytes) -> None:
         """Write a chunk, if it is the one that the release names."""
-        if number >= len(self.chunks) or hashlib.sha256(content).hexdigest() != self.chunks[number]:
+        if number >= len(self.chunks) or sha256(content).hexdigest() != self.chunks[number]:
             raise Refused(f"chunk {number} is not what the release says")
         self.slot.write(number * self.chunk_bytes, content)
 
@@ -170,7 +217,7 @@ class Release:
     def empty_slot(self) -> None:
         """Clear the header of the slot, unless there is none: what is written next is nobody's."""
         if self.slot.header():
-            subprocess.run(["flotilla-slot", "clear", self.slot.name], check=True)
+            run("flotilla-slot", "clear", self.slot.name)
 
     def said(self, missing: list[int]) -> dict[str, Any]:
         return {
@@ -197,17 +244,17 @@ def verify(text: str, signatures: list[str], trusted: dict[str, Any]) -> None:
     directory = f"{RUN}/flotilla-update-{os.getpid()}"
     os.mkdir(directory, 0o700)
     try:
+        write_file(f"{directory}/text", text)
         for key in trusted["keys"]:
             write_file(f"{directory}/allowed", f'{key["name"]} namespaces="{NAMESPACE}" {key["key"]}\n')
             argv = ["ssh-keygen", "-Y", "verify", "-f", f"{directory}/allowed", "-I", key["name"], "-n", NAMESPACE]
             argv += ["-s", f"{directory}/signature"]
             for signature in signatures:
                 write_file(f"{directory}/signature", signature)
-                quiet = subprocess.DEVNULL
-                if subprocess.run(argv, input=text.encode(), stdout=quiet, stderr=quiet, check=False).returncode == 0:
+                if ended(start(*argv, given=f"{directory}/text", quiet=True)) == 0:
                     signed.add(key["name"])
     finally:
-        subprocess.run(["rm", "-rf", directory], check=True)
+        run("rm", "-rf", directory)
     if len(signed) < trusted["signatures"]:
         names = ", ".join(key["name"] for key in trusted["keys"])
         raise Refused(
@@ -217,7 +264,7 @@ def verify(text: str, signatures: list[str], trusted: dict[str, Any]) -> None:
 
 
 def write_file(path: str, text: str) -> None:
-    with open(path, "w") as file:
+    with open(path, "w", newline="") as file:  # what is signed, to the byte
         file.write(text)
 
 
@@ -265,7 +312,7 @@ def copy() -> dict[str, Any]:
     release.empty_slot()
     for number in release.missing():
         content = release.base.read(number * release.chunk_bytes, release.length(number))
-        if hashlib.sha256(content).hexdigest() == release.chunks[number]:
+        if sha256(content).hexdigest() == release.chunks[number]:
             release.take(number, bytes(content))
     release.slot.flush()
     return release.said(release.missing())
@@ -287,16 +334,20 @@ def delta() -> dict[str, Any]:
     if release.running:
         raise Refused("this release runs already")
     release.empty_slot()
-    with subprocess.Popen(["flotilla-patch", partition(release.base.name)], stdout=subprocess.PIPE) as patch:
+    beside_kib = 0
+    fd, pid = piped("flotilla-patch", partition(release.base.name))
+    with open(fd, "rb") as patched:
         for number in range(len(release.chunks)):
-            content = patch.stdout.read(release.length(number)) if patch.stdout else b""
-            if hashlib.sha256(content).hexdigest() != release.chunks[number]:
-                patch.kill()  # of another base, or cut off: what is missing comes as chunks
+            content = patched.read(release.length(number))
+            beside_kib = max(beside_kib, peak_kib(pid))
+            if sha256(content).hexdigest() != release.chunks[number]:
+                os.kill(pid, SIGKILL)  # of another base, or cut off: what is missing comes as chunks
                 break
             if not release.holds(number):
                 release.take(number, content)
+    ended(pid)
     release.slot.flush()
-    return release.said(release.missing())
+    return release.said(release.missing()) | {"beside_kib": beside_kib}
 
 
 def finish() -> dict[str, Any]:
@@ -308,6 +359,8 @@ def finish() -> dict[str, Any]:
         release.slot.flush()
         release.slot.write(release.slot.size - HEADER_ROOM, block)
         release.slot.flush()
+    if not missing:  # nothing of it is needed any more
+        run("rm", "-rf", f"{KNOWN}/spool")
     return release.said(missing)
 
 
@@ -317,22 +370,22 @@ def activate() -> dict[str, Any]:
         raise Refused("this release runs already")
     if not release.staged():
         raise Refused(f"slot {release.slot.name} does not hold release {release.header['RELEASE']} yet: `finish` first")
-    subprocess.run(["rm", "-rf", f"{LAYERS}/{release.slot.name}"], check=True)
+    run("rm", "-rf", f"{LAYERS}/{release.slot.name}")
     os.sync()
-    subprocess.run(["flotilla-slot", "trial", release.slot.name], check=True)
+    run("flotilla-slot", "trial", release.slot.name)
     return release.said([])
 
 
 def yield_to_tasks() -> None:
     """Use the processor and the card when nobody else does."""
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    subprocess.run(["ionice", "-c", "3", "-p", str(os.getpid())], check=True)
+    run("ionice", "-c", "3", "-p", str(os.getpid()))
 
 
-def peak_kib() -> int:
-    """The most memory that this process has had; what getrusage(2) says may be its parent's."""
-    with open("/proc/self/status") as status:
-        return int(next(line.split()[1] for line in status if line.startswith("VmHWM:")))
+def peak_kib(process: int | str = "self") -> int:
+    """The most memory that a process has had; 0 when it has ended. What getrusage(2) says may be its parent's."""
+    with open(f"/proc/{process}/status") as status:
+        return int(next((line.split()[1] for line in status if line.startswith("VmHWM:")), "0"))
 
 
 def main() -> int:
@@ -343,10 +396,10 @@ def main() -> int:
     yield_to_tasks()
     try:
         said = commands[sys.argv[1]]()
-    except (Refused, OSError, ValueError, KeyError, subprocess.CalledProcessError) as error:
+    except (Refused, OSError, ValueError, KeyError) as error:
         print(f"update: {error}" if isinstance(error, Refused) else f"update: {error!r}", file=sys.stderr)
         return 1
-    said["memory_kib"] = peak_kib()
+    said["memory_kib"] = peak_kib() + said.pop("beside_kib", 0)
     print(json.dumps(said))
     return 0
 

@@ -1,0 +1,180 @@
+"""Courses in virtual time: one guest that boots the shipped system, with the robot's tasks, drivers and CAN.
+
+The tasks are those that images bring, rendered for the fleet of `inventory/`. Two CAN boards are on one bus: the
+robot's own, and the drives'. The scanner is a pseudo terminal, as its USB has no bit rate. A run repeats to the byte.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flotilla.common import progress
+from flotilla.common.errors import UserError
+from flotilla.fleet import identity
+from flotilla.fleet.model import Board, Fleet
+from flotilla.station import telemetry
+from images.builder import runtime
+from lab.latency import machine, results, subject
+from lab.scenarios.flight import Record, records
+from lab.scenarios.virtual import PLANT, far
+from lab.wheeled import plant
+from lab.wheeled.by_wires import fleet
+from lab.wheeled.plant import BITRATE, Plant, Trouble
+
+HERE = Path(__file__).parent
+DIRECTORY = subject.DIRECTORY
+CAN_BOARDS = ("-object", "can-bus,id=bus", *("-device", "kvaser_pci,canbus=bus") * 2)
+OWN, DRIVES = "can0", "can1"
+LASER = "/dev/robot/laser"
+COMMAND_PORT = 5030
+"""As drive.yml has it."""
+TASKS = ("perceive", "drive")
+_BOOT_LIMIT_S = 600
+_LIMIT_PER_SECOND = 40
+"""Of the host's clock, for each virtual second: finite, and generous to a busy host."""
+
+Said = tuple[float, float, float, bool]
+"""v, omega, boom, enable."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a station commands, and what happens meanwhile. Times are seconds after the tasks' start."""
+
+    name: str
+    seconds: float
+    commands: Sequence[tuple[float, Said | None]]
+    """None: silence."""
+    plant: Plant = field(default_factory=Plant)
+    events: Sequence[tuple[float, Sequence[str]]] = ()
+    """Commands that are run on the robot's computer."""
+
+
+_OFF: Said = (0, 0, 0, False)
+_ON: Said = (0, 0, 0, True)
+COURSE = Course(
+    "course", 26,
+    [
+        (0, _OFF), (3, _ON), (4, (0.4, 0, 0.1, True)), (6, (0.3, 0.3, 0.1, True)), (8, (0, -0.6, 0.1, True)),
+        (9, (0, 0, 0.1, True)), (9.5, (0.5, 0, 0.1, True)), (18.5, (0, 0.8, 0.1, True)), (21, (0, 0, 0.1, True)),
+        (21.5, (0.5, 0, 0.1, True)), (23, None),
+    ],
+)  # fmt: skip
+"""Ahead, a curve, on the spot, towards the wall until it stops, away from it, and no more commands."""
+SILENT_S = 23.0
+TOWARDS_S = (9.5, 18.5)
+_AROUND: Said = (0.3, 0.6, 0, True)
+TROUBLES = Course(
+    "troubles", 29,
+    [
+        (0, _OFF), (3, _ON), (4, _AROUND), (16, _OFF), (16.5, _ON), (17.5, _AROUND), (24, _OFF), (24.5, _ON),
+        (25.5, _AROUND),
+    ],
+    Plant(troubles=[Trouble(7, 10, "scanner"), Trouble(13, 14, "left", 0x2310)]),
+    [(20, ("ip", "link", "set", OWN, "down")), (22, ("ip", "link", "set", OWN, "up"))],
+)  # fmt: skip
+"""Round and round; its scanner is unplugged for a while, a drive faults, the bus is lost."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What came of a course. All times are of one clock."""
+
+    plant: list[Record]
+    reports: list[dict[str, Any]]
+    """What the robot told the station, with `time_ns` when it came."""
+    statistics: dict[str, dict[str, Any]]
+    logs: dict[str, str]
+    begin_ns: int
+    statuses: dict[str, int]
+
+    def at_s(self, record: Record) -> float:
+        """After the tasks' start."""
+        seconds: float = (record["time_ns"] - self.begin_ns) / 1e9
+        return seconds
+
+    def between(self, begin_s: float, end_s: float) -> list[Record]:
+        """Of the plant."""
+        return [record for record in self.plant if begin_s <= self.at_s(record) < end_s]
+
+    def told(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
+        return [report for report in self.reports if begin_s <= self.at_s(report) < end_s]
+
+
+def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str, bytes]:
+    """What enters the guest: by path."""
+    robot = described.robot_with("drive")
+    tasks = identity.control_tasks(described, robot)
+    there = {
+        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
+        f"{DIRECTORY}/guest.py": (HERE / "guest.py").read_bytes(),
+    }
+    there |= {f"{DIRECTORY}/{name}.yml": tasks[name] for name in TASKS}
+    listed = []
+    for course in courses:
+        file = f"{DIRECTORY}/{course.name}.yml"
+        there[file] = yaml.safe_dump(plant.task(course.plant, DRIVES, LASER)).encode()
+        own = [{"name": "plant", "file": file, "blocks": f"{DIRECTORY}/plant"}]
+        own += [{"name": name, "file": f"{DIRECTORY}/{name}.yml"} for name in TASKS]
+        listed.append(
+            {"name": course.name, "seconds": course.seconds, "tasks": own, "commands": course.commands,
+             "events": course.events}
+        )  # fmt: skip
+    document = {
+        "robot": str(robot.address), "station": str(described.stations[0].address), "command_port": COMMAND_PORT,
+        "report_port": _stream(described).port, "laser": LASER, "interfaces": [OWN, DRIVES], "bitrate": BITRATE,
+        "courses": listed,
+    }  # fmt: skip
+    return there | {f"{DIRECTORY}/session.json": json.dumps(document, sort_keys=True).encode()}
+
+
+def _stream(described: Fleet) -> telemetry.Stream:
+    (stream,) = telemetry.streams(described)
+    return stream
+
+
+def drive(courses: Sequence[Course], board: Board, out: Path) -> dict[str, Driven]:
+    """Drive one course after the other in one guest; by their names."""
+    described = fleet()
+    out.mkdir(parents=True, exist_ok=True)
+    measured = subject.build(board)
+    initrd = out / "initrd.img"
+    commands = {"session": ["python3", f"{DIRECTORY}/guest.py", f"{DIRECTORY}/session.json"]}
+    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, files(courses, described, board))
+    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=CAN_BOARDS)
+    console = out / machine.CONSOLE
+    console.unlink(missing_ok=True)
+    seconds = {course.name: course.seconds for course in courses}
+    with progress.step(f"{len(courses)} courses", lambda: far(progress.text(console), seconds)):
+        limit_s = _BOOT_LIMIT_S + _LIMIT_PER_SECOND * sum(seconds.values())
+        document = results.received(guest.run(out, limit_s))
+    initrd.unlink()
+    said = json.loads(document["commands"]["session"])
+    for name, content in said["files"].items():
+        file = out / "courses" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(base64.b64decode(content))
+    if "error" in said:
+        raise UserError(f"the course failed in the guest:\n{said['error'].strip()}")
+    return {course.name: read(out / "courses" / course.name, described) for course in courses}
+
+
+def read(directory: Path, described: Fleet) -> Driven:
+    """What a course left in a folder."""
+    stream = _stream(described)
+    station = json.loads((directory / "station.json").read_text())
+    return Driven(
+        records(directory / "plant", "driven"),
+        [{"time_ns": time_ns, **stream.unpack(bytes.fromhex(raw))} for time_ns, raw in station["reports"]],
+        {name: json.loads((directory / name / "statistics.json").read_text()) for name in TASKS},
+        {name: (directory / name / "log").read_text() for name in ("plant", *TASKS)},
+        station["begin_ns"],
+        station["statuses"],
+    )
