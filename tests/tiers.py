@@ -18,10 +18,10 @@ TIERS = {"unit": "unit", "runtime": "runtime", "image": "image"} | dict.fromkeys
 LONGEST = (
     "test_fleet.py",
     "shared",
-    "test_update_airtime.py",
     "test_boot_loader.py",
     "test_power_cuts_guest.py",
     "test_power_cuts.py",
+    "test_update_airtime.py",
     "test_update.py",
     "test_bad_releases.py",
     "test_deploy.py",
