@@ -95,6 +95,7 @@ ELSEWHERE = {
     "make deploy ROBOT=3 APP=apps/hover RUN=status": "needs the robot; test_deploy.py asks a guest",
     "make deploy ROBOT=3 APP=apps/hover ON_ROBOT=1": "needs the robot; test_deploy.py compiles on a guest",
     "make verify ROBOT=3": "test_verify.py",
+    "build/venv/bin/pytest tests/runtime/test_wheeled.py": "is a test by itself",
     "make latency": "test_latency.py measures the same",
     "make latency-accept": "changes what tests compare with",
 }
