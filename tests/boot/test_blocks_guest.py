@@ -208,6 +208,28 @@ blocks:
     type: differential-odometry
     in: {left: wheels.left, right: wheels.right}
     parameters: {radius: 0.1, track: 0.4}
+  driven:
+    type: encoder-odometry
+    in: {left: way.out, right: observed.value, flag: 1}
+    parameters: {radius: 0.1, track: 0.4, fastest: 100}
+  range: {type: sum, in: {in0: control.out, in1: 1.2}}
+  scan: {type: join, in: {in0: range.out, in1: range.out, in2: 2.5}, parameters: {inputs: 3}}
+  clearance:
+    type: curve-clearance
+    in: {ranges: scan.out, flag: 1}
+    parameters: {points: 3, first: -0.4, increment: 0.4, radius: 0.3, least_seen: 0, curvatures: [-1, 0, 1]}
+  slowed:
+    type: obstacle-stop
+    in:
+      v: chosen.out
+      omega: filtered.out
+      speed: driven.v
+      rate: driven.omega
+      flag: clearance.flag
+      age: 0.01
+      sequence: step.out0
+      clearance: clearance.clearance
+    parameters: {curvatures: [-1, 0, 1], deceleration: 0.5, delay: 0.1, margin: 0.05}
   attitude: {type: angles-to-quaternion, in: {roll: limited.out, pitch: turned.y, yaw: before.out}}
   angles: {type: quaternion-to-angles, in: {quaternion: attitude.quaternion}}
   valves:
@@ -225,6 +247,8 @@ OBSERVED = (
     "bias.out,biased.out,scaled.out,both.out,filtered.out,limited.out,limited.limited,turned.x,turned.y,before.out,"
     "way.out,observed.value,observed.rate,control.out,control.saturated,switch.on,switch.sign,any.out,chosen.out,"
     "wheels.left,wheels.right,wheels.limited,pose.v,pose.omega,pose.x,pose.y,pose.heading,attitude.quaternion,"
+    "driven.v,driven.omega,driven.x,driven.y,driven.heading,driven.lost,range.out,scan.out,clearance.clearance,"
+    "clearance.flag,slowed.v,slowed.omega,slowed.limited,slowed.free,"
     "angles.roll,angles.pitch,angles.yaw,valves.valves,valves.on_time,"
     "valves.achieved,valves.saturated,spots.count,spots.x,spots.y,spots.brightness,spots.flag,spots.sequence"
 )

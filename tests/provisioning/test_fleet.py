@@ -169,7 +169,7 @@ def test_a_robots_own_report_stops_the_roll_out(guests: Guests) -> None:
     stop = f"while :; do kill -STOP {pid}; sleep 0.05; kill -CONT {pid}; sleep 0.05; done"
     guests.sudo("robot1", f"systemd-run --unit disturbing -p RuntimeMaxSec={RUN_SECONDS} sh -c '{stop}'")
     assert "steps overran, more than 1 %" in unhealthy(overruns_percent=1)
-    # On a busy computer a stop may last longer than the actuator's timeout: the guard ends the task, which starts again.
+    # On a busy computer a stop may last longer than the actuator's timeout: the guard ends the task, which restarts.
     guests.sudo("robot1", f"systemctl stop disturbing || true; kill -CONT {pid} || true")
     done = guests.play("-l", "robot1", playbook="tasks")
     assert " overruns in " in done.said

@@ -11,6 +11,7 @@ from flotilla.common import paths
 from flotilla.fleet import identity, messages
 from flotilla.fleet.inventory import load_fleet
 from lab.scenarios import virtual
+from lab.wheeled.by_wires import INVENTORY as WHEELED
 from tests.runtime.tasks import HEADERS, PLUGIN, Tasks, compile_shared, task
 
 REFUSED = {
@@ -169,12 +170,14 @@ def test_the_worked_example_is_a_block(tasks: Tasks, tmp_path: Path) -> None:
 
 
 def test_the_example_tasks_are_right(tasks: Tasks) -> None:
-    """As robots get them. Those that talk to others are of the scenarios' fleet."""
+    """As robots get them. Those that talk to others are of the scenarios' fleet, or of the wheeled robot."""
     alone = load_fleet()
     single = alone.robots[1].model_copy(update={"control_tasks": ["heading", "heartbeat"]})
     several = virtual.fleet("udp")
+    wheeled = load_fleet(WHEELED)
     seen = set()
-    for fleet, robot in [(alone, single), *((several, robot) for robot in several.robots.values())]:
+    fleets = [(fleet, robot) for fleet in (several, wheeled) for robot in fleet.robots.values()]
+    for fleet, robot in [(alone, single), *fleets]:
         for name, content in identity.control_tasks(fleet, robot).items():
             argv = tasks.argv(content.decode(), "--check")
             done = subprocess.run(argv, capture_output=True, text=True, check=False)

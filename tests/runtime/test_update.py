@@ -149,6 +149,12 @@ def robot(tmp_path: Path, keys: Path, flotilla_slot: Path, monkeypatch: pytest.M
     for name, value in (("KNOWN", tmp_path / "known"), ("RUN", tmp_path), ("LAYERS", tmp_path / "data")):
         monkeypatch.setattr(module, name, str(value))
     monkeypatch.setattr(module, "disk", lambda: str(file))
+
+    class Slot(module.Slot):  # type: ignore[name-defined,misc]  # the program ends instead of closing the card
+        def __del__(self) -> None:
+            os.close(self._fd)
+
+    monkeypatch.setattr(module, "Slot", Slot)
     return Robot(module, file, keys, new)
 
 
