@@ -47,7 +47,7 @@ size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size $(call need,ROBOT)
 
 ##@ Fleet
-.PHONY: fleet fleet-status fleet-down fleet-scale provision update releases
+.PHONY: fleet fleet-status fleet-down fleet-scale provision update releases station-join station-leave
 fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
 	$(Q)$(FLOTILLA) fleet up $(call need,N)
 
@@ -69,6 +69,12 @@ provision: | setup ## robots become what the inventory says: make provision [ROB
 
 releases: | setup ## which release each robot runs, since when, on trial or confirmed: make releases [ROBOT=3] [JSON=1]
 	$(Q)$(FLOTILLA) releases $(if $(value ROBOT),$(call given,ROBOT)) $(if $(filter-out 0,$(JSON)),--json)
+
+station-join: | setup ## put this computer's 802.11 adapter into the robots' ad hoc cell: make station-join [ADAPTER=wlan0] [STATION=]
+	$(Q)$(FLOTILLA) station-join $(if $(value ADAPTER),$(call given,ADAPTER)) $(call option,--station,STATION)
+
+station-leave: | setup ## take it out of the cell, and put everything back: make station-leave [ADAPTER=wlan0]
+	$(Q)$(FLOTILLA) station-leave $(if $(value ADAPTER),$(call given,ADAPTER))
 
 ##@ Apps
 .PHONY: new-app deploy

@@ -310,6 +310,30 @@ def _record_arguments(parser: argparse.ArgumentParser) -> None:
     command.record_arguments(parser)
 
 
+def _station_join(arguments: argparse.Namespace) -> None:
+    from flotilla.station import cell
+
+    cell.join(arguments)
+
+
+def _station_join_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import cell
+
+    cell.join_arguments(parser)
+
+
+def _station_leave(arguments: argparse.Namespace) -> None:
+    from flotilla.station import cell
+
+    cell.leave(arguments)
+
+
+def _station_leave_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import cell
+
+    cell.leave_arguments(parser)
+
+
 def _live_arguments(parser: argparse.ArgumentParser) -> None:
     from flotilla.station import command
 
@@ -384,6 +408,10 @@ COMMANDS = (
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Robots", "station-join", "put this computer's 802.11 adapter into the robots' cell", _station_join,
+            _station_join_arguments),
+    Command("Robots", "station-leave", "take it out, and put everything back", _station_leave,
+            _station_leave_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
