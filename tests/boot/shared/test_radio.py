@@ -49,8 +49,8 @@ def test_radio_joins_the_cell_whenever_it_is_plugged_in(pentium: RobotGuest, fle
 def test_a_station_joins_the_cell_and_leaves_it(pentium: RobotGuest, fleet: Fleet) -> None:
     """The program of `make station-join` with a real iw and kernel; the guest stands in for a desktop computer.
 
-    A robot's radio is in the cell already. `nmcli` is a script that notes what it is asked. Seen to fail without
-    `fixed-freq BSSID` (another BSSID), and without each of the lines that put something back.
+    A robot's radio is in the cell already. `nmcli` is a script that notes what it is asked. Seen to fail
+    where `leave` did not set the adapter's type back.
     """
     assert fleet.network.ibss
     ibss = fleet.network.ibss
