@@ -32,9 +32,7 @@ from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet, Robot
-from flotilla.robot import ssh
 from flotilla.station import telemetry
-from flotilla.station.recording import Value
 from images.builder import build, runtime
 from lab.plants import wheeled
 from lab.qemu import qemu
@@ -112,6 +110,8 @@ class LiveRobot:
     """Where this computer reaches it; its reports come from there."""
     machine: Guest
     shell: Ssh
+    ssh_port: int
+    """Of the loopback, which leads to its SSH."""
 
     @property
     def command_address(self) -> tuple[str, int]:
@@ -188,13 +188,13 @@ class Live:
         (port,) = {stream.port for stream in self._streams.values()}
         return port
 
-    def report(self, index: int = 0) -> dict[str, Value]:
+    def report(self, index: int = 0) -> dict[str, Any]:
         """The newest that a robot told its station; empty before it has told any."""
         name = self.robots[index].robot.name
         datagram = self._newest.get((name, self.report_port))
         return self._streams[name, self.report_port].unpack(datagram) if datagram else {}
 
-    def truth(self, index: int = 0) -> dict[str, Value]:
+    def truth(self, index: int = 0) -> dict[str, Any]:
         """The newest of the plant: where the robot really is; `plant.TRUTH` has the names. Empty before the first."""
         datagram = self._newest.get((self.robots[index].robot.name, plant.TRUTH_PORT))
         return plant.truth(datagram) if datagram else {}
@@ -266,11 +266,10 @@ def robots(
             stack.callback(cable.close)
             port = segment.ssh_port(robot.address)
             shell = stack.enter_context(Ssh(robot, "127.0.0.1", functools.partial(int, port)))
-            live.robots.append(LiveRobot(robot, address, machine, shell))
+            live.robots.append(LiveRobot(robot, address, machine, shell, port))
         _boot(live)
         for index, one in enumerate(live.robots):
             _bring(live, fleet, index, Plant(room, figures={"initial_pose": starts[index]}))
-            stack.enter_context(ssh.announced(one.robot, segment.ssh_port(one.robot.address)))
         yield live
 
 
