@@ -268,7 +268,7 @@ def robots(
             shell = stack.enter_context(Ssh(robot, "127.0.0.1", functools.partial(int, port)))
             live.robots.append(LiveRobot(robot, address, machine, shell, port))
         _boot(live)
-        for index, one in enumerate(live.robots):
+        for index in range(n):
             _bring(live, fleet, index, Plant(room, figures={"initial_pose": starts[index]}))
         yield live
 

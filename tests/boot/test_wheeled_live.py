@@ -6,43 +6,41 @@ One robot for all tests: each begins where the one before left it, and leaves it
 
 from __future__ import annotations
 
-import itertools
 import math
 import select
-import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from flotilla.station import receiver, telemetry
+from flotilla.station import driving, receiver, telemetry
+from flotilla.station.driving import RATE_HZ, Driving
 from lab.qemu.timing import Deadline
 from lab.wheeled import live
-from lab.wheeled.guest import COMMAND
 from lab.wheeled.live import Live
 
 PATIENCE_S = 300
 """Until something comes of a command; only finite."""
-INTERVAL_S = 0.1
-"""Between two commands."""
+ME = driving.Operator("test", "test")
 MARGIN_M = 0.11
 """Before a wall, where it stops by the manual."""
 
 
 class Operator:
-    """Says the same until told otherwise, as a station does."""
+    """Gives the station's sender the same input until told otherwise."""
 
-    def __init__(self, there: Live) -> None:
-        self._robot = there.robots[0].command_address
-        self._says: tuple[float, float, float, bool] | None = None
-        self._sequence = itertools.count(1)
+    def __init__(self, there: Live, locks: Path) -> None:
+        self._driving = Driving(there.fleet, there.station_address, locks=locks)
+        self._says: dict[str, Any] | None = None
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._send)
+        self._driving.take("rover", ME)
         self._thread.start()
 
     def say(self, v: float = 0, omega: float = 0, boom: float = 0, *, enable: bool = True) -> None:
-        self._says = v, omega, boom, enable
+        self._says = {"v": v, "omega": omega, "boom": boom, "enable": enable}
 
     def silence(self) -> None:
         self._says = None
@@ -50,12 +48,13 @@ class Operator:
     def close(self) -> None:
         self._end.set()
         self._thread.join()
+        self._driving.close()
 
     def _send(self) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            while not self._end.wait(INTERVAL_S):
-                if says := self._says:
-                    out.sendto(COMMAND.pack(next(self._sequence), *says), self._robot)
+        while not self._end.wait(1 / RATE_HZ):
+            if self._says:
+                self._driving.drive("rover", ME.id, **self._says)
+                self._driving.tick()
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +64,9 @@ def there(session_artefacts: Path) -> Iterator[Live]:
 
 
 @pytest.fixture(scope="module")
-def operator(there: Live) -> Iterator[Operator]:
+def operator(there: Live, session_artefacts: Path) -> Iterator[Operator]:
     """The motors are on."""
-    operator = Operator(there)
+    operator = Operator(there, session_artefacts)
     try:
         operator.say(enable=False)
         there.until(lambda: there.report()["command"], PATIENCE_S, "a command arrives")
