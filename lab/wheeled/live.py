@@ -43,7 +43,7 @@ from lab.qemu.timing import Deadline, Expired
 from lab.scenarios.virtual import PLANT
 from lab.wheeled import plant
 from lab.wheeled.by_wires import INVENTORY
-from lab.wheeled.plant import BITRATE, Plant
+from lab.wheeled.plant import BITRATE, Plant, Room
 from lab.wheeled.virtual import CAN_BOARDS, COMMAND_PORT, DRIVES, LASER
 
 DIRECTORY = paths.BUILD / "wheeled"
@@ -288,7 +288,9 @@ def _bring(live: Live, fleet: Fleet, index: int, there: Plant) -> None:
     """The plant into a guest."""
     one = live.robots[index]
     board = fleet.boards[one.robot.board]
-    task = plant.task(there, DRIVES, LASER, station=str(fleet.stations[0].address))
+    others = {each.number: str(each.address) for each in fleet.robots.values() if each.number != one.robot.number}
+    station = str(fleet.stations[0].address)
+    task = plant.task(there, DRIVES, LASER, station=station, room=Room(one.robot.number, others))
     with progress.step(f"plant of {one.robot.name}"):
         one.shell.run(["mkdir", "-p", _THERE])
         one.shell.write(f"{_THERE}/plant.so", runtime.compile_plugin(PLANT, board.architecture))
