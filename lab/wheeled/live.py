@@ -157,11 +157,13 @@ def udp_to(address: bytes, frame: bytes) -> tuple[int, bytes] | None:
     Nothing that robots report is so long that it comes in fragments.
     """
     packet = frame[14:]
-    if len(packet) < 28 or frame[12:14] != b"\x08\x00" or packet[0] >> 4 != 4 or packet[9] != socket.IPPROTO_UDP:
+    if len(packet) < 20 or frame[12:14] != b"\x08\x00" or packet[0] >> 4 != 4 or packet[9] != socket.IPPROTO_UDP:
         return None
     if packet[16:20] != address or int.from_bytes(packet[6:8]) & 0x3FFF:  # a fragment
         return None
     begin = 4 * (packet[0] & 0xF)
+    if len(packet) < begin + 8:
+        return None
     port, length = struct.unpack_from(">2xHH", packet, begin)
     return port, packet[begin + 8 : begin + length]
 

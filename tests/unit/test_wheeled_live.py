@@ -35,11 +35,12 @@ def test_the_datagram_of_a_frame() -> None:
     "other",
     [
         frame(b"to another", IPv4Address("10.43.0.2")), frame(b"IPv6", kind=0x86DD), frame(b"TCP", protocol=6),
-        frame(b"a fragment", offset=0x2000), frame(b"its rest", offset=3), b"short", b"",
+        frame(b"a fragment", offset=0x2000), frame(b"its rest", offset=3),
+        frame(b"cut in its header")[:14], frame(b"cut behind it")[: 14 + 30],
     ],
 )  # fmt: skip
 def test_other_frames_have_none(other: bytes) -> None:
-    """Seen to fail with each condition left out, but for the last two frames, which raised."""
+    """Seen to fail with each condition left out; the last two raised."""
     assert live.udp_to(STATION.packed, other) is None
 
 
