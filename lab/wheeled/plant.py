@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
+from flotilla.station.recording import Field, Value
 from lab.plants import wheeled
 
 RECORDED = {
@@ -22,6 +23,12 @@ RECORDED = {
     "scans": ("scanner.sent", "uint32", 1),
 }
 """What it records: signal, type and width by name."""
+TRUTH = {name: RECORDED[name] for name in ("pose", "motion", "least", "contacts", "position", "powered", "scans")}
+"""What it tells a station, in this order and without gaps."""
+TRUTH_PORT = 5099
+"""UDP port of that."""
+TRUTH_STEPS = 25
+"""Between two of these."""
 PERIOD_MS = 2
 RECORD_STEPS = 5
 """Between two records."""
@@ -41,6 +48,24 @@ class Trouble:
     """EMCY error code: overcurrent."""
 
 
+POSE_PORT = 5080
+"""Others' poses come to this UDP port and the other's number."""
+POSE_STEPS = 10
+"""Between two of them."""
+AWAY_S = 10.0
+"""A robot whose plant is silent for so long is not in the room any more."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """Who else is in the room, by plants of their own."""
+
+    number: int
+    """This robot's."""
+    others: Mapping[int, str]
+    """Addresses by number."""
+
+
 @dataclass(frozen=True)
 class Plant:
     """Where and how the robot is."""
@@ -54,8 +79,10 @@ class Plant:
 AXES = ("left", "right", "boom")
 
 
-def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[str, Any]:
-    """Drives on a CAN interface, the scanner at the link `laser`.
+def task(
+    plant: Plant, interface: str, laser: str, priority: int = 40, station: str = "", room: Room | None = None
+) -> dict[str, Any]:
+    """Drives on a CAN interface, the scanner at the link `laser`. It records, or tells the address `station`.
 
     Of less priority than the robot's tasks and between their releases: devices have processors of their own.
     """
@@ -89,22 +116,87 @@ def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[s
             "parameters": {"on": 0.5, "off": 0.5},
         },
         "unplug": _pulses([(trouble, 1) for trouble in plant.troubles if trouble.what == "scanner"]),
-        "driven": {
-            "type": "recorder",
-            "every": RECORD_STEPS,
-            "in": {name: signal for name, (signal, _, _) in RECORDED.items()},
-            "parameters": {
-                "directory": ".",
-                "names": list(RECORDED),
-                "types": [kind for _, kind, _ in RECORDED.values()],
-                "widths": [width for _, _, width in RECORDED.values()],
-                "sync": 0,
-            },
-        },
     }
+    blocks |= _told(station) if station else _recorded()
+    if room and room.others:
+        blocks["robot"]["in"] |= {"others": "others.out", "there": "there.out"}
+        blocks["robot"]["parameters"]["others"] = len(room.others)
+        blocks |= _together(room)
     for name in AXES:
         blocks[name] = _pulses([(trouble, trouble.code) for trouble in plant.troubles if trouble.what == name])
     return {"period": f"{PERIOD_MS} ms", "phase": "1 ms", "priority": priority, "overruns": 0, "blocks": blocks}
+
+
+def truth(datagram: bytes) -> dict[str, Value]:
+    """What the plant told."""
+    return {field.name: field.of(datagram) for field in _fields()}
+
+
+def _fields() -> list[Field]:
+    fields: list[Field] = []
+    for name, (_, kind, width) in TRUTH.items():
+        fields.append(Field(name, kind, width, fields[-1].end if fields else 0))
+    return fields
+
+
+def _recorded() -> dict[str, Any]:
+    return {"driven": _all("recorder", RECORDED, RECORD_STEPS, directory=".", sync=0)}
+
+
+def _told(station: str) -> dict[str, Any]:
+    return {
+        "truth": _all("pack", TRUTH, TRUTH_STEPS),
+        "to_station": {
+            "type": "udp-send",
+            "every": TRUTH_STEPS,
+            "in": {"data": "truth.out"},
+            "parameters": {"address": station, "port": TRUTH_PORT, "length": _fields()[-1].end},
+        },
+    }
+
+
+def _together(room: Room) -> dict[str, Any]:
+    """Where the robot is, to the others; where they are."""
+    poses = [f"pose{number}.pose[{axis}]" for number in room.others for axis in range(3)]
+    blocks: dict[str, Any] = {
+        "own": {"type": "pack", "every": POSE_STEPS, "in": {"pose": "robot.pose"}, "parameters": _pose()},
+        "to_others": {
+            "type": "udp-send",
+            "every": POSE_STEPS,
+            "in": {"data": "own.out"},
+            "parameters": {"address": list(room.others.values()), "port": POSE_PORT + room.number, "length": 24},
+        },
+    }
+    for number, address in room.others.items():
+        blocks[f"other{number}"] = {
+            "type": "udp-receive",
+            "parameters": {"port": POSE_PORT + number, "from": address, "length": 24, "timeout": AWAY_S},
+        }
+        blocks[f"pose{number}"] = {"type": "unpack", "in": {"in": f"other{number}.data"}, "parameters": _pose()}
+    there = [f"other{number}.flag" for number in room.others]
+    for name, kind, wires in (("others", "double", poses), ("there", "boolean", there)):
+        ends = {f"in{i}": wire for i, wire in enumerate(wires)}
+        blocks[name] = {"type": "join", "in": ends, "parameters": {"inputs": len(wires), "type": kind}}
+    return blocks
+
+
+def _pose() -> dict[str, Any]:
+    return {"names": ["pose"], "types": ["double"], "widths": [3]}
+
+
+def _all(kind: str, signals: Mapping[str, tuple[str, str, int]], every: int, **parameters: object) -> dict[str, Any]:
+    """A block that takes them all."""
+    return {
+        "type": kind,
+        "every": every,
+        "in": {name: signal for name, (signal, _, _) in signals.items()},
+        "parameters": {
+            "names": list(signals),
+            "types": [kind for _, kind, _ in signals.values()],
+            "widths": [width for _, _, width in signals.values()],
+            **parameters,
+        },
+    }
 
 
 def steps(rows: Sequence[tuple[float, Sequence[float]]]) -> dict[str, Any]:
