@@ -68,8 +68,8 @@ def card_with(fleet: Fleet, bad: Content, to: Path) -> Path:
     ],
 )
 def test_the_former_release_is_back_by_itself(
-    fault: str, sign: str, bites: bool, fleet: Fleet, content: Content, flotilla_slot: Path, artefacts: Path, tmp_path: Path,
-    record_property: Callable[[str, object], None],
+    fault: str, sign: str, bites: bool, fleet: Fleet, content: Content, flotilla_slot: Path, artefacts: Path,
+    tmp_path: Path, record_property: Callable[[str, object], None],
 ) -> None:  # fmt: skip
     (tmp_path / "bad").mkdir()
     image = card_with(fleet, content.release(2, tmp_path / "bad", fault), tmp_path / "card")
