@@ -257,6 +257,7 @@ static int last_words(void (*action)(struct fl_block *block), char *words, size_
         atomic_store(&test.held[SLOW], true);
         block->release_ns = fl_now_ns() - INT64_C(1000000000000);
         step_with(block, 1);
+        sem_wait(&test.began[SLOW]);
         action(block);
         _exit(0);
     }
