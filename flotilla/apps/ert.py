@@ -215,7 +215,7 @@ def block(
     found = read(model, preprocess(out, model, code, architecture), code, sample_times_s)
     found.inner = (out / INNER).is_file()
     if tasking != "single":
-        _separate(found, code, wanted=tasking == "threads")
+        separate(found, code, wanted=tasking == "threads")
     (out / "flotilla_block.c").write_text(render(found, name))
 
 
@@ -300,7 +300,7 @@ def render(model: Model, name: str) -> str:
     return environment.from_string(TEMPLATE.read_text()).render(model=model, name=name)
 
 
-def _separate(model: Model, code: Code, *, wanted: bool) -> None:
+def separate(model: Model, code: Code, *, wanted: bool) -> None:
     """Give each slower rate a thread where the code permits it; UserError where it does not, and that is `wanted`.
 
     Root ports are in structures that all rates share. The coder gives a port one sample time, so the functions of one
