@@ -26,7 +26,7 @@ struct rate {
     const struct fl_rate *rate;
     struct fl_block *block;
     pthread_t thread;
-    sem_t released, ended;
+    sem_t released, ended, left; /* `left`: the thread does nothing more */
     _Atomic bool running, stop;
     bool started;        /* the thread */
     bool due;            /* in this step, and not running */
@@ -54,8 +54,10 @@ static void *serve(void *argument)
     privilege_touch_stack();
     for (;;) {
         wait_for(&rate->released);
-        if (atomic_load_explicit(&rate->stop, memory_order_acquire))
+        if (atomic_load_explicit(&rate->stop, memory_order_acquire)) {
+            sem_post(&rate->left);
             return NULL;
+        }
         int64_t begin_ns = fl_now_ns();
         rate->rate->run(rate->block);
         int64_t took_ns = fl_now_ns() - begin_ns;
@@ -91,6 +93,7 @@ int fl_rates_start(struct fl_block *block, const struct fl_rate *rates, uint32_t
         rate->block = block;
         sem_init(&rate->released, 0, 0);
         sem_init(&rate->ended, 0, 0);
+        sem_init(&rate->left, 0, 0);
         int error = fl_service_thread(&service, &rate->thread, rates[i].name, serve, rate);
         if (error)
             return fl_fail(block, "cannot start the thread of %s: %s", rates[i].name, strerror(error));
@@ -191,9 +194,14 @@ void fl_rates_stop(struct fl_block *block)
         struct rate *rate = &rates->each[i];
         if (!rate->started)
             continue;
-        if (pthread_clockjoin_np(rate->thread, NULL, CLOCK_MONOTONIC, &until) != 0)
+        int waited;
+        while ((waited = sem_clockwait(&rate->left, CLOCK_MONOTONIC, &until)) < 0 && errno == EINTR)
+            continue;
+        if (waited < 0)
             abandon(rate, "did not end with the task", fl_now_ns() - rate->released_ns);
+        pthread_join(rate->thread, NULL);
         rate->started = false;
+        sem_destroy(&rate->left);
         sem_destroy(&rate->released);
         sem_destroy(&rate->ended);
     }
