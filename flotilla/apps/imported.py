@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import shutil
 import stat
 import tempfile
 import zipfile
@@ -60,7 +59,9 @@ def create(
             assert isinstance(known.description, app.Ert)
             if model != known.description.model:
                 where = paths.shown(directory / app.FILE)
-                raise UserError(f"{where}: model: {known.description.model}: the archive is of {model}; take another NAME=")
+                raise UserError(
+                    f"{where}: model: {known.description.model}: the archive is of {model}; take another NAME="
+                )
             _replace(work / ert.GENERATED, directory / ert.GENERATED)
             return f"{paths.shown(directory)} has the new code; bring it to a robot: {_deploy(directory)}"
         description = {"kind": "ert", "model": model}
@@ -95,7 +96,9 @@ def _unpack(archive: Path, out: Path) -> None:
                 path = PurePosixPath(name.replace("\\", "/"))
                 link = stat.S_ISLNK(member.external_attr >> 16)
                 if path.is_absolute() or ".." in path.parts or ":" in path.parts[0] or link:
-                    raise UserError(f"{archive}: {name}: is no file inside the archive; pack it with packNGo(buildInfo)")
+                    raise UserError(
+                        f"{archive}: {name}: is no file inside the archive; pack it with packNGo(buildInfo)"
+                    )
                 if path.suffix.lower() not in _KEPT:
                     continue
                 files += 1
@@ -112,7 +115,14 @@ def _unpack(archive: Path, out: Path) -> None:
                 place.write_bytes(data)
     except FileNotFoundError:
         raise UserError(f"ZIP={archive}: is missing; packNGo(buildInfo) in MATLAB makes it") from None
-    except (zipfile.BadZipFile, NotADirectoryError, FileExistsError, IsADirectoryError, RuntimeError, EOFError) as error:
+    except (
+        zipfile.BadZipFile,
+        NotADirectoryError,
+        FileExistsError,
+        IsADirectoryError,
+        RuntimeError,
+        EOFError,
+    ) as error:
         raise UserError(f"{archive}: is no archive of packNGo: {error}; pack it anew") from None
     if not files:
         raise UserError(f"{archive}: has no C file; pack it with packNGo(buildInfo)")

@@ -236,6 +236,8 @@ static void put_value(FILE *out, const struct fl_parameter *parameter)
     const char *value = parameter->default_value;
     if (parameter->kind == FL_KIND_BOOLEAN)
         fputs(value && strcmp(value, "true") == 0 ? "1" : "0", out);
+    else if (is_number(parameter) && value && strncmp(value, "0x", 2) == 0)
+        fprintf(out, "%llu", strtoull(value, NULL, 16)); /* in MATLAB 0x1 is no double */
     else if (is_number(parameter))
         fputs(value ? value : "NaN", out); /* which no block accepts */
     else if (parameter->kind == FL_KIND_DOUBLES)

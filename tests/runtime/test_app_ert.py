@@ -201,7 +201,7 @@ blocks:
 
 
 def controller(errors: list[float], kp: float, ki: float, limit: float, weighted: float) -> list[float]:
-    """What the sample's header says its model does: the integral comes to the fast rate one period of the slow later."""
+    """What the sample's header says its model does: the fast rate sees the integral one slow period later."""
     commands, integral, handed = [], 0.0, 0.0
     for step, error in enumerate(errors):
         if step % 5 == 0:
