@@ -83,9 +83,13 @@ station-leave: | setup ## take it out of the cell, and put everything back: make
 	$(Q)$(FLOTILLA) station-leave $(if $(value ADAPTER),$(call given,ADAPTER))
 
 ##@ Apps
-.PHONY: new-app deploy
+.PHONY: new-app import-model deploy
 new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|fmu|make NAME=hover
 	$(Q)$(FLOTILLA) new-app $(call need,KIND) $(call need,NAME)
+
+import-model: | setup ## MATLAB's packNGo archive becomes apps/NAME: ZIP=hover.zip NAME=hover [MODEL=] [SAMPLE_TIMES=0.01,0.05]
+	$(Q)$(FLOTILLA) import-model $(call need,ZIP) $(call need,NAME) $(call option,--model,MODEL) \
+	    $(call option,--sample-times,SAMPLE_TIMES)
 
 deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [ON_ROBOT=1] [KEEP=1 | RUN=start|stop|status|log|remove]
 	$(Q)$(FLOTILLA) deploy $(call need,ROBOT) $(call need,APP) $(call option,--run,RUN) \

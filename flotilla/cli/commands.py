@@ -273,6 +273,26 @@ def _new_app_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", help="of the app, and of its directory in apps/")
 
 
+def _import_model(arguments: argparse.Namespace) -> None:
+    from flotilla.apps import imported
+    from flotilla.fleet import inventory
+
+    architectures = sorted({board.architecture for board in inventory.load_fleet().boards.values()})
+    times_s = arguments.sample_times or []
+    print(imported.create(arguments.archive, arguments.name, architectures, arguments.model, times_s))
+
+
+def _import_model_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("archive", type=Path, metavar="zip", help="what packNGo(buildInfo) made in MATLAB")
+    parser.add_argument("name", help="of the app, and of its directory in apps/")
+    parser.add_argument("--model", help="its name, where the archive has several")
+    parser.add_argument("--sample-times", type=_seconds, metavar="S,…", help="in seconds, fastest first, for a new app")
+
+
+def _seconds(text: str) -> list[float]:
+    return [float(each) for each in text.split(",")]
+
+
 def _deploy(arguments: argparse.Namespace) -> None:
     import functools
 
@@ -414,6 +434,8 @@ COMMANDS = (
             _station_leave_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
+    Command("Apps", "import-model", "make an app of what MATLAB's packNGo packed, or renew its code", _import_model,
+            _import_model_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
     Command("Shell", "completion", "print what makes a shell complete these words", _completion,
             _completion_arguments),
