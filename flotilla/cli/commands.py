@@ -366,6 +366,18 @@ def _top_arguments(parser: argparse.ArgumentParser) -> None:
     command.top_arguments(parser)
 
 
+def _drive(arguments: argparse.Namespace) -> None:
+    from flotilla.station import drive
+
+    drive.run(arguments)
+
+
+def _drive_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import drive
+
+    drive.drive_arguments(parser)
+
+
 def _report(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths
     from flotilla.station import report
@@ -432,6 +444,7 @@ COMMANDS = (
             _station_join_arguments),
     Command("Robots", "station-leave", "take it out, and put everything back", _station_leave,
             _station_leave_arguments),
+    Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
     Command("Apps", "import-model", "make an app of what MATLAB's packNGo packed, or renew its code", _import_model,
