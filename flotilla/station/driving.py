@@ -48,7 +48,7 @@ SILENT_S = 5.0
 """A holder without any input for so long holds nothing any more."""
 APART_S = 1.2
 """From the last datagram of one hold to the first of the next: the robot takes two that speak within 1 s for a
-conflict (`guard.timeout` of drive.yml)."""
+conflict (`guard.apart` of drive.yml)."""
 LOCKS = paths.BUILD / "run"
 """A file for each robot that is held, locked by the program that sends to it."""
 

@@ -1,12 +1,13 @@
 """The robot's two tasks and its plant as one task, on this computer, by a clock that counts: seconds for a minute.
 
-The tasks are those that images bring. In place of blocks with devices, of the queue and of datagrams there are wires
-to the plant and to a script of commands. What drivers, bus and scheduling add, `virtual.py` shows.
+The tasks are those that images bring. In place of blocks with devices and of the queue there are wires to the plant;
+datagrams with commands come from a file. What drivers, bus and scheduling add, `virtual.py` shows.
 """
 
 from __future__ import annotations
 
 import json
+import struct
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,7 @@ from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Fleet
 from lab.plants import wheeled
 from lab.wheeled import plant
+from lab.wheeled.guest import COMMAND
 from lab.wheeled.plant import AXES, Trouble
 
 INVENTORY = Path(__file__).parent / "inventory"
@@ -30,10 +32,14 @@ SCAN_AGE_S = 0.07
 """Of a scan when its last point is measured."""
 _REMOVED = {
     "perceive": ("laser", "to_drive"),
-    "drive": ("clearance", "command", "in", "report", "to_station", *AXES),
+    "drive": ("clearance", "report", "to_station", *AXES),
 }
 
 Row = dict[str, Any]
+
+
+_INTERVAL_S = 0.1
+"""Between two commands of a station."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,24 @@ class Command:
     boom: float = 0
     enable: bool = True
     heard: bool = True
-    """False: nothing comes, or too long ago."""
+    """False: it says nothing."""
+
+
+Datagram = tuple[float, bytes]
+"""When it arrives, in s after the start, and its bytes."""
+
+
+def datagrams(commands: Sequence[Command], seconds: float, operator: int = 1, phase_s: float = 0) -> list[Datagram]:
+    """What a station sends, from the first command on; the times of sending begin at `phase_s`."""
+    sent: list[Datagram] = []
+    for index in range(round(seconds / _INTERVAL_S)):
+        at_s = index * _INTERVAL_S + phase_s
+        said = [command for command in commands if command.at_s <= at_s + 1e-6]
+        if said and said[-1].heard:
+            now = said[-1]
+            values = (operator, len(sent) + 1, now.v, now.omega, now.boom, now.enable)
+            sent.append((at_s, COMMAND.pack(*values)))
+    return sent
 
 
 @dataclass(frozen=True)
@@ -59,6 +82,8 @@ class Course:
     troubles: Sequence[Trouble] = ()
     figures: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     """Parameters that are not those of wheeled_robot.yml."""
+    others: Sequence[Datagram] = ()
+    """What comes to the robot's port beside the commands."""
     changes: Mapping[str, object] = field(default_factory=dict)
     """Parameters of the tasks that are not those of their files, by `block.parameter`."""
 
@@ -67,13 +92,14 @@ def fleet() -> Fleet:
     return inventory.load_fleet(INVENTORY)
 
 
-def task(courses: Sequence[Course], described: Fleet) -> dict[str, Any]:
-    """The whole as one task. Of several courses each is another robot's, in the room of the first."""
-    blocks = _blocks(courses[0], described)
+def task(courses: Sequence[Course], described: Fleet, directory: Path) -> dict[str, Any]:
+    """The whole as one task; datagrams go to files there. Of several courses each is another robot's, in the room of
+    the first."""
+    blocks = _blocks(courses[0], described, directory / "datagrams")
     if len(courses) > 1:
         blocks = {}
         for index, course in enumerate(courses):
-            own = _blocks(replace(course, room=courses[0].room), described)
+            own = _blocks(replace(course, room=courses[0].room), described, directory / f"datagrams{index}")
             blocks |= {_of(index, name): _renamed(block, index) for name, block in own.items()}
         for index in range(len(courses)):
             _meet(blocks, index, [other for other in range(len(courses)) if other != index])
@@ -103,7 +129,8 @@ def _meet(blocks: dict[str, Any], index: int, others: Sequence[int]) -> None:
     blocks[_of(index, "robot")]["parameters"]["others"] = len(others)
 
 
-def _blocks(course: Course, described: Fleet) -> dict[str, Any]:
+def _blocks(course: Course, described: Fleet, file: Path) -> dict[str, Any]:
+    """Of one robot; datagrams go to `file`."""
     tasks = identity.control_tasks(described, described.robot_with("drive"))
     blocks: dict[str, Any] = {}
     wires = _wires()
@@ -115,10 +142,15 @@ def _blocks(course: Course, described: Fleet) -> dict[str, Any]:
                 told["every"] = slower
             told["in"] = {port: _wire(wires[name], name, wire) for port, wire in told.get("in", {}).items()}
             blocks[f"{name}_{block}"] = told
+    come = sorted([*datagrams(course.commands, course.seconds), *course.others], key=lambda each: each[0])
+    file.write_bytes(b"".join(struct.pack("=d", at_s) + datagram for at_s, datagram in come))
+    network = blocks["drive_command"]["parameters"]
+    here = {"file": str(file), "length": network["length"], "timeout": network["timeout"]}
+    blocks["drive_command"] = {"type": "datagrams", "parameters": here}
     for key, value in course.changes.items():
         block, parameter = key.split(".")
         blocks[block]["parameters"][parameter] = value
-    blocks |= _script(course)
+    blocks |= _troubles(course)
     drive = yaml.safe_load(tasks["drive"])["blocks"]
     for port, kind in (("target", "double"), ("enable", "boolean")):
         ends = [_wire(wires["drive"], "drive", drive[name]["in"][port]) for name in AXES]
@@ -143,8 +175,7 @@ def _wires() -> dict[str, dict[str, object]]:
     """What becomes of outputs of the blocks that are not there, by task."""
     drive: dict[str, object] = {
         "clearance.data": "perceive_message.out", "clearance.flag": 1, "clearance.age": 0,
-        "clearance.sequence": "robot.scans", "command.flag": "heard.on", "in.v": "script.position[0]",
-        "in.omega": "script.position[1]", "in.boom": "script.position[2]", "in.enable": "enabled.on",
+        "clearance.sequence": "robot.scans",
     }  # fmt: skip
     for index, name in enumerate(AXES):
         drive |= {
@@ -161,13 +192,8 @@ def _wire(wires: Mapping[str, object], task: str, wire: object) -> object:
     return wires.get(wire, f"{task}_{wire}")
 
 
-def _script(course: Course) -> dict[str, Any]:
-    rows: list[tuple[float, Sequence[float]]] = [
-        (each.at_s, [each.v, each.omega, each.boom, float(each.enable), float(each.heard)]) for each in course.commands
-    ]
-    blocks = {"script": plant.steps(rows)}
-    for index, name in ((3, "enabled"), (4, "heard")):
-        blocks[name] = _flag(f"script.position[{index}]")
+def _troubles(course: Course) -> dict[str, Any]:
+    blocks: dict[str, Any] = {}
     for number, what in enumerate(("scanner", *AXES)):
         at: list[tuple[float, Sequence[float]]] = [(0.0, [0.0])]
         for trouble in course.troubles:
@@ -194,7 +220,9 @@ WATCHED = {
     "least": "robot.least", "position": "robot.position", "x": "drive_odometry.x", "y": "drive_odometry.y",
     "heading": "drive_odometry.heading", "seeing": "drive_seeing.out", "limited": "drive_stop.limited",
     "v": "drive_v_limit.out", "omega": "drive_omega_limit.out", "free": "drive_stop.free",
-    "boom": "drive_boom_length.out",
+    "boom": "drive_boom_length.out", "alive": "drive_alive.out", "operator": "drive_guard.operator",
+    "other": "drive_guard.other", "conflict": "drive_guard.conflict", "refused": "drive_guard.refused",
+    "command": "drive_in.sequence", "enabled": "drive_in.enable",
 }  # fmt: skip
 
 
@@ -209,7 +237,7 @@ def drive_together(
 ) -> list[list[Row]]:
     """Several robots in the room of the first course, for as long as that: each one's rows. They see each other."""
     file = directory / "wheeled.yml"
-    file.write_text(yaml.safe_dump(task(courses, described or fleet())))
+    file.write_text(yaml.safe_dump(task(courses, described or fleet(), directory)))
     steps = round(courses[0].seconds / PERIOD_S)
     watched = [
         {name: _of(index, signal) if len(courses) > 1 else signal for name, signal in WATCHED.items()}

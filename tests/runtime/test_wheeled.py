@@ -20,6 +20,7 @@ from flotilla.common.errors import UserError
 from lab.plants import wheeled
 from lab.wheeled import by_wires
 from lab.wheeled.by_wires import Command, Course, Row
+from lab.wheeled.guest import COMMAND
 from lab.wheeled.plant import Trouble
 from tests.running import PATIENCE
 from tests.runtime import test_plant_blocks
@@ -270,14 +271,99 @@ def test_it_drives_a_course(drive: Drive) -> None:
 
 
 def test_it_stops_when_commands_cease(drive: Drive) -> None:
-    """The dead man's switch: at rest 0.8 s after it, and the boom stays. Seen to fail with the flag of the command left
-    out of `alive`."""
+    """The dead man's switch: at rest 0.8 s after it misses them, 0.3 s after the last one, and the boom stays. Seen to
+    fail with the flag of the guard left out of `alive`."""
     rows = drive(Course(6, [*BY_HAND, Command(1, 0.5, boom=0.5), Command(3, 0.5, boom=0.5, heard=False)]))
     assert rows[299]["motion"][0] > 0.49
-    rest = at_rest_after(rows, 3)
+    rest = at_rest_after(rows, 2.9 + 0.3)
     print(f"at rest after {rest:.2f} s")
     assert rest < 0.8
-    assert rows[-1]["boom"] == pytest.approx(rows[310]["boom"], abs=0.01)
+    assert rows[-1]["boom"] == pytest.approx(rows[325]["boom"], abs=0.01)
+
+
+SECOND = 0xFFFF_FFFE
+"""The number of an operator beside the usual one, which is 1."""
+
+
+def resting(rows: list[Row], begin_s: float, end_s: float) -> bool:
+    return all(
+        abs(row["motion"][0]) < 0.01 and abs(row["motion"][1]) < 0.02
+        for row in rows[round(begin_s / by_wires.PERIOD_S) : round(end_s / by_wires.PERIOD_S)]
+    )
+
+
+@pytest.mark.parametrize("phase_s", [0, 0.001, 0.05], ids=["same-step", "1ms", "between"])
+def test_it_stops_while_two_command(drive: Drive, phase_s: float) -> None:
+    """From 3 s to 5 s a second operator turns it. It comes to rest, names both, and goes on for the first one 1 s after
+    the second one's last command. In one step, too: seen to fail with a receiver that takes the newest datagram only,
+    and with `alive` of a guard that knows no conflict."""
+    second = [Command(3, 0.2, 1.5, 0.4), Command(5, heard=False)]
+    others = by_wires.datagrams(second, 9, SECOND, phase_s)
+    rows = drive(Course(9, [*BY_HAND, Command(1, 0.3)], others=others))
+    assert rows[299]["motion"][0] > 0.29
+    assert resting(rows, 4, 5.9)
+    for row in rows[310:580]:
+        assert (row["conflict"], row["alive"], row["operator"], row["other"]) == (True, False, 1, SECOND)
+    assert rows[-1]["motion"][0] > 0.29
+    assert (rows[-1]["conflict"], rows[-1]["operator"], rows[-1]["other"]) == (False, 1, 0)
+    assert rows[-1]["boom"] == 0, "the second one's command"
+    assert rows[-1]["contacts"] == 0
+
+
+def test_another_may_command_when_the_first_is_silent(drive: Drive) -> None:
+    """A handover between two stations. Until the second one's second command nothing moves."""
+    others = by_wires.datagrams([Command(4, 0, 0.5)], 7, SECOND)
+    rows = drive(Course(7, [*BY_HAND, Command(1, 0.3), Command(2.5, heard=False)], others=others))
+    assert resting(rows, 3.3, 4.1)
+    assert not any(row["conflict"] for row in rows)
+    assert {row["operator"] for row in rows[:400]} == {0, 1}
+    assert rows[-1]["operator"] == SECOND
+    assert rows[-1]["motion"][1] == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_recording_moves_nothing(drive: Drive) -> None:
+    """Commands that came before come again, after the sender has ended and while it sends. Seen to fail with a guard
+    that takes each sequence."""
+    commands = [*BY_HAND, Command(1, 0.3), Command(3, heard=False), Command(7, 0, 0.5)]
+    recorded = [each for each in by_wires.datagrams(commands, 3) if each[0] >= 1]
+    again = [(at_s + later, datagram) for later in (3, 6.03) for at_s, datagram in recorded]
+    rows = drive(Course(9, commands, others=again))
+    assert rows[299]["motion"][0] > 0.29
+    assert resting(rows, 3.9, 7)
+    assert all(abs(row["motion"][0]) < 0.01 for row in rows[390:])
+    assert rows[-1]["motion"][1] == pytest.approx(0.5, abs=0.02)
+    assert rows[-1]["refused"] == len(again)
+    assert not any(row["conflict"] for row in rows)
+
+
+def test_rubbish_of_the_right_length_stops_it_and_moves_nothing(drive: Drive) -> None:
+    """Random bytes, all zeros, and numbers that are none, at the right operator's number, too. Then it goes on."""
+    wild = random.Random(1)
+    nan, inf = math.nan, math.inf
+    said = [(nan, nan, nan), (inf, -inf, inf), (-inf, nan, nan), (1e300, -1e300, -1e300), (nan, 0, nan)]
+    mine = [(4 + index / 10, COMMAND.pack(1, 1000 + index, *values, 255)) for index, values in enumerate(said * 4)]
+    others = [(2 + index / 50, wild.randbytes(COMMAND.size)) for index in range(50)]
+    others += [(2.5, bytes(COMMAND.size))]
+    begin = [*BY_HAND, Command(1, 0.3), Command(4, heard=False)]
+    end = [(7 + index / 10, COMMAND.pack(1, 2000 + index, 0.3, 0, 0, 1)) for index in range(20)]
+    rows = drive(Course(9, begin, others=[*others, *mine, *end]))
+    assert rows[199]["motion"][0] > 0.29
+    assert resting(rows, 2.8, 3.9)
+    assert all(row["operator"] == 1 for row in rows[100:])
+    for row in rows[400:700]:
+        assert all(math.isfinite(value) for value in (row["v"], row["omega"], row["boom"], *row["pose"]))
+        assert abs(row["v"]) <= 0.5
+    assert rows[-1]["motion"][0] > 0.29
+    assert rows[-1]["contacts"] == 0
+
+
+def test_a_sender_that_starts_again_has_a_new_number(drive: Drive) -> None:
+    """Its sequence begins at 1, so with the number that it had before nothing would move."""
+    first = [*BY_HAND, Command(1, 0.3), Command(2, heard=False)]
+    again = [Command(4, 0, 0.5)]
+    for operator, moves in ((1, False), (2, True)):
+        rows = drive(Course(6, first, others=by_wires.datagrams(again, 6, operator)))
+        assert (abs(rows[-1]["motion"][1]) > 0.4) == moves
 
 
 def test_it_stops_without_eyes_and_goes_on_with_them(drive: Drive) -> None:

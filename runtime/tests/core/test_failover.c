@@ -29,8 +29,18 @@ static void one_is_listened_to(void **state)
     }
 }
 
+/* Also where they arrive at one time, as stamps are cut after the clock was set. */
+static void all_are_listened_to(void **state)
+{
+    (void)state;
+    struct fl_failover failover;
+    fl_failover_begin(&failover, 0);
+    for (size_t i = 0; i < 8; i++)
+        assert_true(fl_failover_takes(&failover, i % FL_SENDERS, 10 * MS, 0));
+}
+
 int main(void)
 {
-    const struct CMUnitTest tests[] = {cmocka_unit_test(one_is_listened_to)};
+    const struct CMUnitTest tests[] = {cmocka_unit_test(one_is_listened_to), cmocka_unit_test(all_are_listened_to)};
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

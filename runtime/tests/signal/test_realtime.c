@@ -18,6 +18,7 @@ static void compute(void **state)
 {
     (void)state;
     steps(testbed_block("clock", NULL));
+    steps(testbed_block("command-guard", "length", "8", NULL));
     steps(testbed_block("constant", "value", "1,2", NULL));
     steps(testbed_block("delay", NULL));
     steps(testbed_block("differential-drive", "radius", "0.1", "track", "0.4", NULL));
