@@ -195,7 +195,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param scope record live top report
+.PHONY: runtime check-runtime fuzz bench-runtime param scope record live top drive report
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -239,6 +239,9 @@ live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.
 
 top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
 	$(Q)$(FLOTILLA) top $(station) $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
+
+drive: | setup ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN]
+	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT)
 
 report: | setup ## a page of a recording: paths, commands, hops, latency: make report FILE=run.mcap [OUT=page.html]
 	$(Q)$(FLOTILLA) report $(call need,FILE) $(call option,--out,OUT)

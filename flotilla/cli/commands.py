@@ -322,6 +322,18 @@ def _top_arguments(parser: argparse.ArgumentParser) -> None:
     command.top_arguments(parser)
 
 
+def _drive(arguments: argparse.Namespace) -> None:
+    from flotilla.station import drive
+
+    drive.run(arguments)
+
+
+def _drive_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import drive
+
+    drive.drive_arguments(parser)
+
+
 def _report(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths
     from flotilla.station import report
@@ -384,6 +396,7 @@ COMMANDS = (
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import random
 import signal
 import socket
 import struct
@@ -22,8 +23,10 @@ from typing import Any
 
 COMMAND = struct.Struct("<IIdddB")
 """operator, sequence, v, omega, boom, enable; drive.yml has it, too."""
-OPERATOR = 1
-"""The number of this station."""
+OPERATOR, SECOND = 1, 2
+"""The numbers of this station, and of another one that has its address."""
+FLOOD = 50
+"""Commands in an interval, instead of one."""
 _INTERVAL_S = 0.1
 """Between two commands."""
 _END_S = 5.0
@@ -56,13 +59,26 @@ class Station:
         self.robot = (session["robot"], session["command_port"])
         self.sequence = 0
         self.reports: list[tuple[int, str]] = []
+        self._wild = random.Random(1)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((session["station"], session["report_port"]))
         self._socket.setblocking(False)
 
-    def command(self, v: float, omega: float, boom: float, enable: bool) -> None:
+    def command(self, v: float, omega: float, boom: float, enable: bool, operator: int = OPERATOR) -> None:
         self.sequence += 1
-        self._socket.sendto(COMMAND.pack(OPERATOR, self.sequence, v, omega, boom, enable), self.robot)
+        self._socket.sendto(COMMAND.pack(operator, self.sequence, v, omega, boom, enable), self.robot)
+
+    def disturb(self, what: str) -> None:
+        """For an interval: `second` operator who turns it, `rubbish` of the right and of other lengths, or a `flood` of
+        commands."""
+        if what == "second":
+            self.command(0.2, 1.5, 0.4, True, SECOND)
+        elif what == "rubbish":
+            for length in (COMMAND.size, 1, COMMAND.size - 1, COMMAND.size, 1400, COMMAND.size + 1, 0):
+                self._socket.sendto(self._wild.randbytes(length), self.robot)
+        else:
+            for _ in range(FLOOD):
+                self.command(0.5, 0.6, 0, True)
 
     def hear(self) -> None:
         while True:
@@ -98,6 +114,9 @@ def drive(course: dict[str, Any], session: dict[str, Any], out: Path) -> None:
             run(*events.pop(0)[1])
             happened.append(time.monotonic_ns())
         command(station, course["commands"], at_s)
+        for begin_s, end_s, what in course["disturbances"]:
+            if begin_s <= at_s + 1e-6 < end_s:
+                station.disturb(what)
         station.hear()
         if at_s >= told_s:
             CONSOLE.write_text(f"flight: {course['name']} {at_s:g} s\n")

@@ -55,6 +55,8 @@ class Course:
     plant: Plant = field(default_factory=Plant)
     events: Sequence[tuple[float, Sequence[str]]] = ()
     """Commands that are run on the robot's computer."""
+    disturbances: Sequence[tuple[float, float, str]] = ()
+    """From one time to another: what `Station.disturb` of guest.py does beside the commands."""
 
 
 _OFF: Said = (0, 0, 0, False)
@@ -81,6 +83,12 @@ TROUBLES = Course(
     [(20, ("ip", "link", "set", OWN, "down")), (22, ("ip", "link", "set", OWN, "up"))],
 )  # fmt: skip
 """Round and round; its scanner is unplugged for a while, a drive faults, the bus is lost."""
+
+OPERATORS = Course(
+    "operators", 14, [(0, _OFF), (3, _ON), (3.5, _AROUND)],
+    disturbances=[(5, 6, "second"), (8, 8.4, "rubbish"), (10.2, 10.8, "flood")],
+)  # fmt: skip
+"""Round and round; from the station's address come commands of a second operator, rubbish, and a flood of commands."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,7 @@ def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str
         own += [{"name": name, "file": f"{DIRECTORY}/{name}.yml"} for name in TASKS]
         listed.append(
             {"name": course.name, "seconds": course.seconds, "tasks": own, "commands": course.commands,
-             "events": course.events}
+             "events": course.events, "disturbances": course.disturbances}
         )  # fmt: skip
     document = {
         "robot": str(robot.address), "station": str(described.stations[0].address), "command_port": COMMAND_PORT,

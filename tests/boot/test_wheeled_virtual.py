@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from lab.scenarios.flight import Record
-from lab.wheeled import virtual
+from lab.wheeled import guest, virtual
 from lab.wheeled.by_wires import fleet
 from lab.wheeled.plant import BITRATE
-from lab.wheeled.virtual import COURSE, SILENT_S, TOWARDS_S, TROUBLES, Driven
+from lab.wheeled.virtual import COURSE, OPERATORS, SILENT_S, TOWARDS_S, TROUBLES, Driven
 
 JITTER_NS = {"drive": 100_000, "perceive": 400_000}
 """Not yet 100 µs for `perceive`."""
@@ -29,7 +29,7 @@ STOPS_S = 0.8
 
 @pytest.fixture(scope="module")
 def driven(session_artefacts: Path) -> dict[str, Driven]:
-    return virtual.drive([COURSE, TROUBLES], fleet().board(), session_artefacts / "wheeled")
+    return virtual.drive([COURSE, TROUBLES, OPERATORS], fleet().board(), session_artefacts / "wheeled")
 
 
 @pytest.fixture
@@ -40,6 +40,11 @@ def course(driven: dict[str, Driven]) -> Driven:
 @pytest.fixture
 def troubles(driven: dict[str, Driven]) -> Driven:
     return driven[TROUBLES.name]
+
+
+@pytest.fixture
+def operators(driven: dict[str, Driven]) -> Driven:
+    return driven[OPERATORS.name]
 
 
 def at_rest(record: Record) -> bool:
@@ -151,6 +156,36 @@ def test_without_its_bus_it_stops(troubles: Driven) -> None:
     assert troubles.plant[-1]["contacts"] == 0
 
 
+def test_it_stops_while_a_second_operator_commands(operators: Driven) -> None:
+    """And names both, until 1 s after the second one's last command; its boom does not move. Then it goes on. Seen to
+    fail with a guard that never says conflict."""
+    rests(operators, 5, STOPS_S, 6.8)
+    for report in operators.told(5.2, 6.8):
+        told = {name: report[name] for name in ("alive", "conflict", "operator", "other")}
+        assert told == {"alive": False, "conflict": True, "operator": guest.OPERATOR, "other": guest.SECOND}
+    assert not at_rest(operators.between(7.8, 8)[-1]), "it does not go on"
+    assert not operators.told(7.5, 8)[-1]["conflict"]
+    assert max(report["boom"] for report in operators.reports) == pytest.approx(0, abs=0.001)
+
+
+def test_rubbish_stops_it_and_moves_nothing(operators: Driven) -> None:
+    """Of the right length it may be a second operator's."""
+    rests(operators, 8, STOPS_S, 9.3)
+    assert all(report["operator"] in (0, guest.OPERATOR) for report in operators.reports)
+    assert not at_rest(operators.between(10, 10.2)[-1]), "it does not go on"
+
+
+def test_a_flood_of_commands_stops_it(operators: Driven) -> None:
+    """500 a second are more than it reads: what has waited for longer than the dead man's switch allows moves nothing.
+    It goes on when the queue is empty."""
+    rests(operators, 10.4, DEAD_MAN_S, 12)
+    assert max(report["command_age"] for report in operators.told(10.8, 13)) > 0.5
+    last = operators.reports[-1]
+    assert (last["alive"], last["conflict"], last["refused"]) == (True, False, 0)
+    assert not at_rest(operators.plant[-1]), "it does not go on"
+    assert operators.plant[-1]["contacts"] == 0
+
+
 def test_a_drive_repeats_to_the_byte(driven: dict[str, Driven], artefacts: Path) -> None:
-    again = virtual.drive([COURSE, TROUBLES], fleet().board(), artefacts / "wheeled")
+    again = virtual.drive([COURSE, TROUBLES, OPERATORS], fleet().board(), artefacts / "wheeled")
     assert again == driven
