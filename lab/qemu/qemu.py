@@ -209,23 +209,22 @@ def station_address(network: Network, *taken: IPv4Address) -> IPv4Address:
 def user_netdev(
     identifier: str, subnet: IPv4Network, station: IPv4Address, forwards: Mapping[IPv4Address, int],
     datagrams: Mapping[tuple[IPv4Address, int], int] | None = None,
-    inward: Mapping[tuple[IPv4Address, int], tuple[str, int]] | None = None,
+    outward: bool = True,
 ) -> str:  # fmt: skip
     """A user-mode network: `station` stands for the host, each loopback port of `forwards` leads to a guest's SSH.
 
     `datagrams`: by a guest's address and UDP port, the loopback port that leads there. With it guests also reach the
     host's loopback ports at the station's address; without, they reach nothing but each other.
 
-    `inward`: likewise, by an address and port of the host, and without any way out.
+    `outward`: False: datagrams only come in.
     """
     # QEMU insists on a name server and a DHCP range inside the network; nobody asks them, they only must not collide.
     dns = next(address for address in _from_above(subnet) if address != station and address not in forwards)
     dhcp = next(iter(forwards), subnet[1])
     arguments = [f"user,id={identifier},net={subnet},host={station},dns={dns},dhcpstart={dhcp},ipv6=off"]
-    arguments += [f"restrict={'off' if datagrams else 'on'}"]
+    arguments += [f"restrict={'off' if datagrams and outward else 'on'}"]
     arguments += [f"hostfwd=tcp:127.0.0.1:{port}-{address}:22" for address, port in forwards.items()]
-    udp = {robot: ("127.0.0.1", here) for robot, here in (datagrams or {}).items()} | dict(inward or {})
-    arguments += [f"hostfwd=udp:{host}:{here}-{guest}:{port}" for (guest, port), (host, here) in udp.items()]
+    arguments += [f"hostfwd=udp:127.0.0.1:{here}-{guest}:{port}" for (guest, port), here in (datagrams or {}).items()]
     return ",".join(arguments)
 
 

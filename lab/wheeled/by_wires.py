@@ -93,10 +93,8 @@ def fleet() -> Fleet:
 
 
 def task(courses: Sequence[Course], described: Fleet, directory: Path) -> dict[str, Any]:
-    """The whole as one task. Of several courses each is another robot's, in the room of the first.
-
-    Datagrams go to files in `directory`.
-    """
+    """The whole as one task; datagrams go to files there. Of several courses each is another robot's, in the room of
+    the first."""
     blocks = _blocks(courses[0], described, directory / "datagrams")
     if len(courses) > 1:
         blocks = {}
@@ -132,7 +130,7 @@ def _meet(blocks: dict[str, Any], index: int, others: Sequence[int]) -> None:
 
 
 def _blocks(course: Course, described: Fleet, file: Path) -> dict[str, Any]:
-    """Of one robot; its datagrams go to `file`."""
+    """Of one robot; datagrams go to `file`."""
     tasks = identity.control_tasks(described, described.robot_with("drive"))
     blocks: dict[str, Any] = {}
     wires = _wires()

@@ -56,6 +56,7 @@ BOOT_SECONDS = 900
 BEGIN_SECONDS = 120
 _LOOPBACK = [IPv4Network(f"127.43.{number}.0/24") for number in range(1, 255)]
 """Where this computer may have robots: several labs at once take one each."""
+_LONGEST = 65536
 _THERE = "/home/robot/plant"
 """What is brought into a guest."""
 _BEGIN = f"""
@@ -117,6 +118,36 @@ class LiveRobot:
     def command_address(self) -> tuple[str, int]:
         """Where commands go, by UDP."""
         return self.address, COMMAND_PORT
+
+
+class Commands:
+    """Sends on what comes to the address that a robot has here, whoever it is from on this computer: QEMU takes nobody
+    but 127.0.0.1 for the station."""
+
+    def __init__(self, address: str, port: int) -> None:
+        """`port`: of 127.0.0.1, which leads to the robot."""
+        self._there = ("127.0.0.1", port)
+        self._here = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._here.bind((address, COMMAND_PORT))
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ended.set()
+        with suppress(OSError):  # it says so, though it wakes who receives: it is not connected
+            self._here.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        self._here.close()
+
+    def _listen(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
+            while True:
+                datagram = self._here.recv(_LONGEST)
+                if self._ended.is_set():
+                    return
+                with suppress(ConnectionRefusedError):  # of one before, while the segment ends
+                    there.sendto(datagram, self._there)
 
 
 class Cable:
@@ -245,8 +276,7 @@ def robots(
         station = fleet.stations[0].address
         segment = Segment(
             fleet.network, [robot.address for robot in described], station, directory / "segment",
-            forwards={(robot.address, COMMAND_PORT): (str(_moved(robot.address, subnet)), COMMAND_PORT)
-                      for robot in described},
+            [(robot.address, COMMAND_PORT) for robot in described], outward=False,
         )  # fmt: skip
         stack.enter_context(segment)
         sockets = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lab-")))  # their paths must be short
@@ -261,8 +291,10 @@ def robots(
             image = build.image_of(robot, directory / "images")
             machine = stack.enter_context(Guest(fleet.boards[robot.board], image, there, options))
             machine.prepare()
-            forward = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             address = str(_moved(robot.address, subnet))
+            commands = Commands(address, segment.udp_port(robot.address, COMMAND_PORT))
+            stack.callback(commands.close)
+            forward = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             forward.bind((address, 0))
             cable = Cable(wire, station, functools.partial(live.heard, robot.name, forward))
             stack.callback(cable.close)
