@@ -29,7 +29,7 @@ SLOWER = 10
 SCAN_AGE_S = 0.07
 """Of a scan when its last point is measured."""
 _REMOVED = {
-    "perceive": ("laser", "to_drive"),
+    "perceive": ("laser", "to_drive", "clock", "report", "to_station"),
     "drive": ("clearance", "command", "in", "report", "to_station", *AXES),
 }
 
