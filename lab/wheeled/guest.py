@@ -20,8 +20,10 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-COMMAND = struct.Struct("<IdddB")
-"""sequence, v, omega, boom, enable; drive.yml has it, too."""
+COMMAND = struct.Struct("<IIdddB")
+"""operator, sequence, v, omega, boom, enable; drive.yml has it, too."""
+OPERATOR = 1
+"""The number of this station."""
 _INTERVAL_S = 0.1
 """Between two commands."""
 _END_S = 5.0
@@ -60,7 +62,7 @@ class Station:
 
     def command(self, v: float, omega: float, boom: float, enable: bool) -> None:
         self.sequence += 1
-        self._socket.sendto(COMMAND.pack(self.sequence, v, omega, boom, enable), self.robot)
+        self._socket.sendto(COMMAND.pack(OPERATOR, self.sequence, v, omega, boom, enable), self.robot)
 
     def hear(self) -> None:
         while True:
