@@ -22,6 +22,7 @@ from flotilla.fleet.model import Fleet, Robot
 from flotilla.robot import parameters, scope
 from flotilla.station import page_requests as asked
 from flotilla.station import watching
+from flotilla.station.driving import Driving, Operator
 from flotilla.station.receiver import Receiver
 from flotilla.station.record import Recorder
 from flotilla.station.recording import Value
@@ -114,7 +115,12 @@ class Desk:
         view: View,
         states: Mapping[tuple[str, str], State],
         replay: Replay | None,
+        driving: Driving,
     ) -> None:
+        self._driving = driving
+        self._vehicles = {} if replay else {each.robot: each for each in driving.vehicles}
+        self._asking: dict[str, dict[int, str]] = {robot: {} for robot in self._vehicles}
+        """Browsers that ask for a robot, by number."""
         self._fleet = fleet
         self._robots = {robot.name: robot for robot in fleet.robots.values()}
         self._receiver = receiver
@@ -151,6 +157,7 @@ class Desk:
                      "tasks": robot.control_tasks}
                     for robot in self._robots.values()
                 ],
+                "vehicles": {robot: dict(vehicle.limits) for robot, vehicle in self._vehicles.items()},
                 "streams": self._view.described(),
                 "paths": self._view.paths(),
                 "replay": self._replay and {"file": self._replay.name,
@@ -162,6 +169,12 @@ class Desk:
     def leave(self, session: Session) -> None:
         """It is gone, in whatever way."""
         left = self._open.pop(session)
+        for robot in self._vehicles:
+            self._asking[robot].pop(session.number, None)
+            holder = self._driving.state(robot).holder
+            if holder and holder.id == session.operator.id:
+                self._driving.release(robot, session.operator.id)
+                self.note(f"{robot}: {session.operator.name} is gone: released")
         for watch in left.watches.values():
             watch.cancel()
         for follower in left.followers.values():
@@ -175,6 +188,7 @@ class Desk:
         state = self._view.state() | {
             "type": "state",
             "tasks": {f"{robot} {task}": _task(state) for (robot, task), state in self._states.items()},
+            "driving": {robot: self._held(robot) for robot in self._vehicles},
             "recording": self.recording.state,
             "browsers": len(self._open),
         }
@@ -224,10 +238,70 @@ class Desk:
                 self._set(session, request)
             case asked.Service():
                 self._service(session, request)
-            case asked.Driving() | asked.Drive():
-                pass
+            case asked.Drive():
+                self._drive(session, request)
+            case asked.Driving():
+                self._hold(session, request)
 
-    def _robot(self, request: asked.Parameters | asked.SetParameter | asked.Signals | asked.Watch | asked.Service) -> Robot:
+    def _drive(self, session: Session, request: asked.Drive) -> None:
+        try:
+            self._driving.drive(
+                request.robot, session.operator.id, request.v, request.omega, request.boom, request.enable
+            )  # fmt: skip
+        except UserError as error:
+            session.tell({"type": "refused", "robot": request.robot, "text": f"{error}"})
+
+    def _hold(self, session: Session, request: asked.Driving) -> None:
+        """Whom a robot obeys changes here only."""
+        robot, own = request.robot, session.operator
+        try:
+            if robot not in self._vehicles:
+                raise UserError(f"{robot}: is no robot that can be driven")
+            asking = self._asking[robot]
+            match request.do:
+                case "take":
+                    self._driving.take(robot, own)
+                    asking.pop(session.number, None)
+                    self.note(f"{robot}: {own.name} commands it")
+                case "ask":
+                    asking[session.number] = own.name
+                    self.note(f"{robot}: {own.name} asks for it")
+                case "offer":
+                    to = next((each.operator for each in self._open if each.number == request.to), None)
+                    if request.to is not None and not to:
+                        raise UserError(f"{robot}: browser {request.to} is gone")
+                    self._driving.offer(robot, own.id, to)
+                    self.note(f"{robot}: {own.name} offers it to {to.name if to else 'nobody any more'}")
+                case "accept":
+                    self._driving.accept(robot, own.id)
+                    asking.pop(session.number, None)
+                    self.note(f"{robot}: {own.name} commands it")
+                case "release":
+                    self._driving.release(robot, own.id)
+                    self.note(f"{robot}: {own.name} released it")
+        except (UserError, OSError) as error:
+            session.tell({"type": "refused", "robot": robot, "text": f"{error}"})
+
+    def _held(self, robot: str) -> dict[str, Any]:
+        """Who commands it, for the page."""
+        state = self._driving.state(robot)
+        numbers = {each.operator.id: each.number for each in self._open}
+        return {
+            "holder": state.holder and state.holder.name,
+            "by": numbers.get(state.holder.id) if state.holder else None,
+            "offered": numbers.get(state.offered.id) if state.offered else None,
+            "asking": self._asking[robot],
+            "operator": state.number,
+            "sequence": state.sequence,
+            "sending": state.sending
+            and [state.sending.v, state.sending.omega, state.sending.boom, state.sending.enable],
+            "note": state.note,
+            "error": state.error,
+        }
+
+    def _robot(
+        self, request: asked.Parameters | asked.SetParameter | asked.Signals | asked.Watch | asked.Service
+    ) -> Robot:
         if self._replay:
             raise UserError("this is a recording: robots are not asked")
         robot = self._robots.get(request.robot)
@@ -273,6 +347,10 @@ class Desk:
     def _stop_all(self, session: Session) -> None:
         """Robots at once, each by a thread of its own."""
         robots = [] if self._replay else [robot for robot in self._robots.values() if robot.control_tasks]
+        for name in self._vehicles:
+            holder = self._driving.state(name).holder
+            if holder:
+                self._driving.release(name, holder.id)
         self.note(f"browser {session.number}: stop all: {len(robots)} robots")
 
         async def stop(robot: Robot) -> None:

@@ -17,6 +17,7 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
 from flotilla.station.desk import Desk
+from flotilla.station.driving import Driving
 from flotilla.station.receiver import REFRESH_S, Receiver, drain, listen
 from flotilla.station.replay import Replay
 from flotilla.station.services import Services, State
@@ -35,11 +36,17 @@ def run(arguments: argparse.Namespace) -> None:
     known = streams(fleet)
     replay = Replay(arguments.replay, known) if arguments.replay else None
     receiver = Receiver(replay.streams if replay else known)
-    asyncio.run(_serve(arguments, fleet, receiver, replay, address))
+    with Driving(fleet, arguments.address) as driving:
+        asyncio.run(_serve(arguments, fleet, receiver, replay, driving, address))
 
 
 async def _serve(
-    arguments: argparse.Namespace, fleet: Fleet, receiver: Receiver, replay: Replay | None, address: str
+    arguments: argparse.Namespace,
+    fleet: Fleet,
+    receiver: Receiver,
+    replay: Replay | None,
+    driving: Driving,
+    address: str,
 ) -> None:
     loop = asyncio.get_running_loop()
     ended = asyncio.Event()
@@ -48,7 +55,7 @@ async def _serve(
     view = View(receiver, replay.clock if replay else time.time_ns)
     receiver.sinks.append(view)
     states, trouble = ({}, "") if replay else _states(fleet)
-    desk = Desk(fleet, receiver, view, states, replay)
+    desk = Desk(fleet, receiver, view, states, replay, driving)
     receiver.sinks.append(desk.recording)
     sockets = [] if replay else listen((stream.port for stream in receiver.known.values()), arguments.address)
     for one in sockets:

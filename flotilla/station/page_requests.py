@@ -56,7 +56,9 @@ class Watch(_OfTask):
     signals: Annotated[list[Signal], Field(min_length=1, max_length=16)]
     every: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Steps from one row to the next, if more than the station takes by itself."""
-    trigger: Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.\[\]-]{0,126}[<>]-?[\d.e+-]{1,24}$")] | None = None
+    trigger: Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.\[\]-]{0,126}[<>]-?[\d.e+-]{1,24}$")] | None = (
+        None
+    )
     """`gyro.rate>0.1`: `rows` rows around this moment."""
     before: Annotated[int, Field(ge=0, le=1000)] = 0
     rows: Annotated[int, Field(ge=1, le=2000)] = 1000

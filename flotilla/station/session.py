@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import secrets
 import time
 from collections import deque
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from typing import Any
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from flotilla.station import page_requests
+from flotilla.station.driving import Operator
 from flotilla.station.page_requests import NoRequestError, Request
 
 RATE_HZ = 50
@@ -46,8 +48,8 @@ class Session:
         abort: Callable[[], None],
     ) -> None:
         self.number = number
-        self.place = place
-        """Address it comes from."""
+        self.operator = Operator(f"{number}-{secrets.token_hex(8)}", f"browser {number} at {place}")
+        """Who drives, if it does."""
         self._socket = socket
         self._note = note
         self._abort = abort
@@ -88,7 +90,7 @@ class Session:
         finally:
             sending.cancel()
         if reason:
-            self._note(f"browser {self.number} at {self.place}: {reason}; its connection is closed")
+            self._note(f"{self.operator.name}: {reason}; its connection is closed")
         return reason
 
     def _take(self, data: str | bytes, do: Callable[[Request], None]) -> str:
@@ -99,7 +101,7 @@ class Session:
         if self._allowance < 1:
             self.excess += 1
             if self.excess == 1:
-                self._note(f"browser {self.number} at {self.place}: more than {RATE_HZ} requests a second; left out")
+                self._note(f"{self.operator.name}: more than {RATE_HZ} requests a second; left out")
             return f"{self.excess} requests too many" if self.excess >= EXCESS else ""
         self._allowance -= 1
         try:
@@ -107,7 +109,7 @@ class Session:
         except NoRequestError as error:
             self.garbage += 1
             if self.garbage == 1:
-                self._note(f"browser {self.number} at {self.place}: no request: {error}")
+                self._note(f"{self.operator.name}: no request: {error}")
             return f"{self.garbage} things that are no request" if self.garbage >= GARBAGE else ""
         do(request)
         return ""

@@ -77,9 +77,7 @@ async def rows(robot: Robot, command: Sequence[str], signals: Sequence[str]) -> 
         await asyncio.shield(process.wait())
 
 
-async def _read(
-    lines: asyncio.StreamReader, signals: Sequence[str], batch: asyncio.Queue[list[Any] | None]
-) -> None:
+async def _read(lines: asyncio.StreamReader, signals: Sequence[str], batch: asyncio.Queue[list[Any] | None]) -> None:
     """Rows, and None at the end; a line that is none ends them."""
     with contextlib.suppress(ValueError, KeyError, TypeError):
         while line := await lines.readline():

@@ -97,7 +97,10 @@ class Web:
         if token := request.query.get("token"):  # which is right, or the request would not be here
             headers["Set-Cookie"] = self._access.set_cookie(token)
         return web.Response(
-            body=file.read_bytes(), content_type=kind, charset="utf-8" if kind.startswith("text") else None, headers=headers
+            body=file.read_bytes(),
+            content_type=kind,
+            charset="utf-8" if kind.startswith("text") else None,
+            headers=headers,
         )
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
