@@ -47,7 +47,7 @@ size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size $(call need,ROBOT)
 
 ##@ Fleet
-.PHONY: fleet fleet-status fleet-down fleet-scale provision update releases
+.PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down provision update releases
 fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
 	$(Q)$(FLOTILLA) fleet up $(call need,N)
 
@@ -56,6 +56,12 @@ fleet-status: | setup-tests ## what the guests of the virtual fleet do
 
 fleet-down: | setup-tests ## end the virtual fleet
 	$(Q)$(FLOTILLA) fleet down
+
+wheeled: | setup-tests ## wheeled robots in a room, to be driven from this computer, until Ctrl-C: make wheeled [N=1] [ROOM=corner]
+	$(Q)$(FLOTILLA) wheeled $(call option,--room,ROOM) $(if $(value N),$(call given,N))
+
+wheeled-down: | setup-tests ## end them
+	$(Q)$(FLOTILLA) wheeled-down
 
 fleet-scale: | setup-tests ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
 	$(Q)$(FLOTILLA) fleet-scale $(call need,N) $(call option,--board,BOARD)
@@ -228,7 +234,7 @@ station: | setup ## a page to see the fleet, drive, tune and record it [PORT=808
 	    $(call option,--replay,REPLAY) $(call option,--seconds,SECONDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
-station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS)
+station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)
 record: | setup ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS=]
 	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
 

@@ -120,9 +120,30 @@ def _power_cuts_arguments(parser: argparse.ArgumentParser) -> None:
     command.arguments(parser)
 
 
+def _wheeled(arguments: argparse.Namespace) -> None:
+    from lab.wheeled import command
+
+    command.run(arguments)
+
+
+def _wheeled_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.wheeled import command
+
+    command.arguments(parser)
+
+
+def _wheeled_down(_: argparse.Namespace) -> None:
+    from lab.wheeled import command
+
+    command.down()
+
+
 COMMANDS = (
     Command("Lab", "boot", "boot a robot's image in QEMU on this terminal", _boot, robot_argument),
     Command("Lab", "fleet", "start, show or end a virtual fleet of guests", _fleet, _fleet_arguments),
+    Command("Lab", "wheeled", "wheeled robots as guests in a room, to be driven from this computer", _wheeled,
+            _wheeled_arguments),
+    Command("Lab", "wheeled-down", "end the wheeled robots", _wheeled_down),
     Command("Lab", "fleet-scale", "measure how provisioning grows with the fleet", _fleet_scale,
             _fleet_scale_arguments),
     Command("Lab", "emulate", "emulate a serial device until interrupted", _emulate, _emulate_arguments),

@@ -101,6 +101,9 @@ class Options:
     `lab/power_cuts/write_log.py` reads it."""
     virtual_time: bool = False
     """Time advances by instructions executed, not by the host's clock, and idle time is skipped."""
+    steady: bool = False
+    """Time advances by instructions executed, but no faster than the host's clock: a host that stops the guest for a
+    while, or is too slow for it, makes it slow, and nothing in it late."""
     extra: tuple[str, ...] = ()
     """Further arguments."""
 
@@ -113,6 +116,8 @@ def command_line(board: Board, card: Path, options: Options) -> list[str]:
         # One thread, fixed seed and clock: tried to repeat to the byte, see the facts on testing networks.
         argv += ["-accel", "tcg,thread=single", "-icount", "shift=3,sleep=off", "-machine", "hpet=off,usb=off"]
         argv += ["-rtc", f"base={_VIRTUAL_START.isoformat()},clock=vm", "-seed", "1"]
+    elif options.steady:
+        argv += ["-accel", "tcg,thread=single", "-icount", "shift=3,sleep=on,align=on", "-rtc", "base=utc,clock=vm"]
     else:
         argv += ["-accel", "tcg", "-rtc", "base=utc"]
     argv += ["-action", f"watchdog={options.watchdog}"]
@@ -204,11 +209,14 @@ def station_address(network: Network, *taken: IPv4Address) -> IPv4Address:
 def user_netdev(
     identifier: str, subnet: IPv4Network, station: IPv4Address, forwards: Mapping[IPv4Address, int],
     datagrams: Mapping[tuple[IPv4Address, int], int] | None = None,
+    inward: Mapping[tuple[IPv4Address, int], tuple[str, int]] | None = None,
 ) -> str:  # fmt: skip
     """A user-mode network: `station` stands for the host, each loopback port of `forwards` leads to a guest's SSH.
 
     `datagrams`: by a guest's address and UDP port, the loopback port that leads there. With it guests also reach the
     host's loopback ports at the station's address; without, they reach nothing but each other.
+
+    `inward`: likewise, by an address and port of the host, and without any way out.
     """
     # QEMU insists on a name server and a DHCP range inside the network; nobody asks them, they only must not collide.
     dns = next(address for address in _from_above(subnet) if address != station and address not in forwards)
@@ -216,7 +224,8 @@ def user_netdev(
     arguments = [f"user,id={identifier},net={subnet},host={station},dns={dns},dhcpstart={dhcp},ipv6=off"]
     arguments += [f"restrict={'off' if datagrams else 'on'}"]
     arguments += [f"hostfwd=tcp:127.0.0.1:{port}-{address}:22" for address, port in forwards.items()]
-    arguments += [f"hostfwd=udp:127.0.0.1:{here}-{guest}:{port}" for (guest, port), here in (datagrams or {}).items()]
+    udp = {robot: ("127.0.0.1", here) for robot, here in (datagrams or {}).items()} | dict(inward or {})
+    arguments += [f"hostfwd=udp:{host}:{here}-{guest}:{port}" for (guest, port), (host, here) in udp.items()]
     return ",".join(arguments)
 
 

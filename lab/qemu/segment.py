@@ -9,10 +9,11 @@ Not multicast, where every member hears itself: QEMU's user-mode network answers
 from __future__ import annotations
 
 import socket
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import ExitStack
 from ipaddress import IPv4Address
 from pathlib import Path
+from types import MappingProxyType
 
 from flotilla.fleet.model import Fleet, Network
 from lab.qemu import qemu
@@ -25,18 +26,21 @@ class Segment:
     def __init__(
         self, network: Network, robots: Iterable[IPv4Address], station: IPv4Address, directory: Path,
         datagrams: Collection[tuple[IPv4Address, int]] = (),
+        forwards: Mapping[tuple[IPv4Address, int], tuple[str, int]] = MappingProxyType({}),
     ) -> None:  # fmt: skip
         """`station`: the address under which the host appears on the segment.
 
         `datagrams`: robots' UDP ports to which the host is to send, to each by its `udp_port()`; then what robots send
         to the station comes to the host's loopback ports.
+
+        `forwards`: by a robot's UDP port, the host's address and port that lead there. By itself that lets nothing out.
         """
         directory.mkdir(parents=True, exist_ok=True)
         robots = list(robots)
         ports = iter(free_udp_ports(2 * len(robots) + len(datagrams)))
         self._links = {robot: qemu.Wire(next(ports), next(ports)) for robot in robots}
         self._udp = dict(zip(datagrams, ports, strict=True))
-        user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0), self._udp)
+        user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0), self._udp, forwards)
         self._emulator = Emulator(lambda qmp: self._command_line(user, qmp), directory)
         self._ports = self._emulator.forwards()
 

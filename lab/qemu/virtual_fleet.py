@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import argparse
 import concurrent.futures
-import fcntl
 import functools
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -29,7 +27,7 @@ from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet, Health, Robot
 from flotilla.robot import ssh
 from images.builder.build import image_of
-from lab.qemu import qemu
+from lab.qemu import holder, qemu
 from lab.qemu.guest import Guest
 from lab.qemu.segment import Segment, station_address
 from lab.qemu.ssh import Ssh
@@ -110,20 +108,20 @@ def up(count: int) -> None:
     argv = [sys.executable, "-m", "flotilla", "fleet", "hold", str(count)]
     progress.command(argv)
     with progress.step(f"boot {count} guests") as step, _LOG.open("w") as log:
-        holder = subprocess.Popen(
+        process = subprocess.Popen(
             argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True, cwd=paths.PROJECT,
             start_new_session=True,  # Ctrl-C here is not meant for it
         )  # fmt: skip
         try:
-            assert holder.stdout
+            assert process.stdout
             awaited = [robot.name for robot in robots]
             step.at(0, count, "guests", awaited[0])
-            for number, _ in enumerate(holder.stdout, 1):  # a line for each that has booted
+            for number, _ in enumerate(process.stdout, 1):  # a line for each that has booted
                 step.at(number, count, "guests", *awaited[number : number + 1])
-            if holder.poll() is not None or not guest_ports():
+            if process.poll() is not None or not guest_ports():
                 raise UserError(f"the virtual fleet did not start; {paths.shown(_LOG)} says:\n{_LOG.read_text()}")
         except BaseException:
-            holder.terminate()
+            process.terminate()
             raise
     _say(guest_ports(), f"runs on {fleet.network.subnet}")
 
@@ -154,24 +152,14 @@ def status() -> str:
 
 def down() -> str:
     """End the virtual fleet, be it still starting, and remove what it left."""
-    ended = "no virtual fleet runs"
-    signalled = False
-    deadline = time.monotonic() + DOWN_SECONDS
-    while (lock := _free_lock()) is None:
-        if not signalled and (holder := _LOCK.read_text()):
-            ports = _written_ports()
-            ended = f"{len(ports)} guests ended" if ports else "the virtual fleet ended before it had started"
-            with suppress(ProcessLookupError):  # it has just ended
-                os.kill(int(holder), signal.SIGTERM)
-            signalled = True
-        if time.monotonic() > deadline:
-            raise UserError(
-                f"the virtual fleet did not end within {DOWN_SECONDS} s; process {_LOCK.read_text()} holds it"
-            )
-        time.sleep(0.05)  # the lock tells nobody when it becomes free within a bound
+    ports = _written_ports()
+    lock, ran = holder.end(_LOCK, DOWN_SECONDS)
+    if lock is None:
+        raise UserError(f"the virtual fleet did not end within {DOWN_SECONDS} s; process {_LOCK.read_text()} holds it")
+    ended = f"{len(ports)} guests ended" if ports else "the virtual fleet ended before it had started"
     with lock:
         GUESTS.unlink(missing_ok=True)
-    return ended
+    return ended if ran else "no virtual fleet runs"
 
 
 def hold(count: int) -> None:
@@ -181,8 +169,7 @@ def hold(count: int) -> None:
     if lock is None:
         raise UserError("a virtual fleet runs already; end it: make fleet-down")
     with lock, ExitStack() as stack:
-        lock.write(str(os.getpid()))
-        lock.flush()
+        holder.sign(lock)
         GUESTS.unlink(missing_ok=True)
         for directory in filter(Path.is_dir, DIRECTORY.iterdir()):
             shutil.rmtree(directory)  # a killed fleet's: its guests' overlays may be of other images
@@ -236,15 +223,7 @@ def _written_ports() -> dict[str, int]:
 
 def _free_lock() -> IO[str] | None:
     """The lock, empty and held until it is closed; None when a fleet runs."""
-    DIRECTORY.mkdir(parents=True, exist_ok=True)
-    lock = _LOCK.open("a+")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.close()
-        return None
-    lock.truncate(0)  # a killed fleet's process may be another by now
-    return lock
+    return holder.free(_LOCK)
 
 
 def _say(ports: Mapping[str, int], how: str) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
+from flotilla.station.recording import Field, Value
 from lab.plants import wheeled
 
 RECORDED = {
@@ -22,6 +23,12 @@ RECORDED = {
     "scans": ("scanner.sent", "uint32", 1),
 }
 """What it records: signal, type and width by name."""
+TRUTH = {name: RECORDED[name] for name in ("pose", "motion", "least", "contacts", "position", "powered", "scans")}
+"""What it tells a station, in this order and without gaps."""
+TRUTH_PORT = 5099
+"""UDP port of that."""
+TRUTH_STEPS = 25
+"""Between two of these."""
 PERIOD_MS = 2
 RECORD_STEPS = 5
 """Between two records."""
@@ -54,8 +61,8 @@ class Plant:
 AXES = ("left", "right", "boom")
 
 
-def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[str, Any]:
-    """Drives on a CAN interface, the scanner at the link `laser`.
+def task(plant: Plant, interface: str, laser: str, priority: int = 40, station: str = "") -> dict[str, Any]:
+    """Drives on a CAN interface, the scanner at the link `laser`. It records, or tells the address `station`.
 
     Of less priority than the robot's tasks and between their releases: devices have processors of their own.
     """
@@ -89,22 +96,54 @@ def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[s
             "parameters": {"on": 0.5, "off": 0.5},
         },
         "unplug": _pulses([(trouble, 1) for trouble in plant.troubles if trouble.what == "scanner"]),
-        "driven": {
-            "type": "recorder",
-            "every": RECORD_STEPS,
-            "in": {name: signal for name, (signal, _, _) in RECORDED.items()},
-            "parameters": {
-                "directory": ".",
-                "names": list(RECORDED),
-                "types": [kind for _, kind, _ in RECORDED.values()],
-                "widths": [width for _, _, width in RECORDED.values()],
-                "sync": 0,
-            },
-        },
     }
+    blocks |= _told(station) if station else _recorded()
     for name in AXES:
         blocks[name] = _pulses([(trouble, trouble.code) for trouble in plant.troubles if trouble.what == name])
     return {"period": f"{PERIOD_MS} ms", "phase": "1 ms", "priority": priority, "overruns": 0, "blocks": blocks}
+
+
+def truth(datagram: bytes) -> dict[str, Value]:
+    """What the plant told."""
+    return {field.name: field.of(datagram) for field in _fields()}
+
+
+def _fields() -> list[Field]:
+    fields: list[Field] = []
+    for name, (_, kind, width) in TRUTH.items():
+        fields.append(Field(name, kind, width, fields[-1].end if fields else 0))
+    return fields
+
+
+def _recorded() -> dict[str, Any]:
+    return {"driven": _all("recorder", RECORDED, RECORD_STEPS, directory=".", sync=0)}
+
+
+def _told(station: str) -> dict[str, Any]:
+    return {
+        "truth": _all("pack", TRUTH, TRUTH_STEPS),
+        "to_station": {
+            "type": "udp-send",
+            "every": TRUTH_STEPS,
+            "in": {"data": "truth.out"},
+            "parameters": {"address": station, "port": TRUTH_PORT, "length": _fields()[-1].end},
+        },
+    }
+
+
+def _all(kind: str, signals: Mapping[str, tuple[str, str, int]], every: int, **parameters: object) -> dict[str, Any]:
+    """A block that takes them all."""
+    return {
+        "type": kind,
+        "every": every,
+        "in": {name: signal for name, (signal, _, _) in signals.items()},
+        "parameters": {
+            "names": list(signals),
+            "types": [kind for _, kind, _ in signals.values()],
+            "widths": [width for _, _, width in signals.values()],
+            **parameters,
+        },
+    }
 
 
 def steps(rows: Sequence[tuple[float, Sequence[float]]]) -> dict[str, Any]:
