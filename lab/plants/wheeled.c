@@ -93,6 +93,21 @@ void wheeled_begin(struct wheeled *robot, const struct wheeled_parameters *param
     robot->least = wheeled_nearest(robot);
 }
 
+bool wheeled_meet(struct wheeled *robot, double x, double y)
+{
+    if (robot->other_count == WHEELED_OTHERS)
+        return false;
+    robot->others[2 * robot->other_count] = x;
+    robot->others[2 * robot->other_count + 1] = y;
+    robot->other_count++;
+    return true;
+}
+
+void wheeled_part(struct wheeled *robot)
+{
+    robot->other_count = 0;
+}
+
 /* --- motors --- */
 
 static double clamped(double value, double limit)
@@ -170,10 +185,15 @@ double wheeled_nearest(const struct wheeled *robot)
     double nearest = INFINITY;
     for (uint32_t i = 0; i < robot->wall_count; i++)
         nearest = fmin(nearest, segment_distance(&robot->walls[(size_t)4 * i], robot->pose[0], robot->pose[1]));
+    for (uint32_t i = 0; i < robot->other_count; i++) {
+        const double *other = &robot->others[(size_t)2 * i];
+        double between = hypot(other[0] - robot->pose[0], other[1] - robot->pose[1]);
+        nearest = fmin(nearest, between - robot->parameters.body_radius);
+    }
     return nearest - robot->parameters.body_radius;
 }
 
-/* A wall takes the speed of what runs into it, and stays where it is. */
+/* A wall, or another robot, takes the speed of what runs into it, and stays where it is. */
 static void touch(struct wheeled *robot, const double before[2])
 {
     double nearest = wheeled_nearest(robot), x = robot->pose[0], y = robot->pose[1];
@@ -245,6 +265,13 @@ double wheeled_cast(const struct wheeled *robot, double bearing)
         double range = (to_x * along_y - to_y * along_x) / cross, at = (to_x * ray_y - to_y * ray_x) / cross;
         if (range >= 0 && at >= 0 && at <= 1)
             nearest = fmin(nearest, range);
+    }
+    for (uint32_t i = 0; i < robot->other_count; i++) {
+        double to_x = robot->others[(size_t)2 * i] - x, to_y = robot->others[(size_t)2 * i + 1] - y;
+        double along = to_x * ray_x + to_y * ray_y, beside = to_x * ray_y - to_y * ray_x;
+        double radius = robot->parameters.body_radius;
+        if (along >= 0 && fabs(beside) <= radius)
+            nearest = fmin(nearest, fmax(0, along - sqrt(radius * radius - beside * beside)));
     }
     return nearest;
 }

@@ -1,5 +1,5 @@
 /* The wheeled robot as physics: two driven wheels on one axle that may slip, a body, an extendable boom, and a laser
- * scanner in a room of straight walls.
+ * scanner in a room of straight walls, with other robots of its kind as discs.
  *
  *   wheel   J_w · ω̇ = τ − r · F − d · ω,  F = μ · N · tanh((r·ω − g)/s),  g: speed of the axle over the floor there
  *   body    m · v̇ = F_l + F_r − c · tanh(v / 0.01 m/s),  J · Ω̇ = (F_r − F_l − c · tanh(Ω · b/2 / 0.01 m/s)) · b/2
@@ -23,7 +23,7 @@
 #include <stdint.h>
 
 enum { WHEELED_LEFT, WHEELED_RIGHT, WHEELED_BOOM, WHEELED_AXES };
-enum { WHEELED_WALLS = 256 }; /* at most */
+enum { WHEELED_WALLS = 256, WHEELED_OTHERS = 16 }; /* at most */
 
 /* Directions of a URG-04LX: 1024 in a turn, of which it measures these; FRONT looks ahead. */
 enum { WHEELED_FIRST = 44, WHEELED_LAST = 725, WHEELED_FRONT = 384, WHEELED_TURN = 1024 };
@@ -87,14 +87,16 @@ struct wheeled {
     struct wheeled_parameters parameters;
     double walls[4 * WHEELED_WALLS]; /* x, y of the ends of each */
     uint32_t wall_count;
+    double others[2 * WHEELED_OTHERS]; /* x, y of each */
+    uint32_t other_count;
     int64_t now_ns;
     double pose[3];     /* x m, y m, heading rad */
     double speed, rate; /* of the body: m/s ahead, rad/s */
     struct wheeled_axis axis[WHEELED_AXES];
     double slip[2];    /* m/s, of each wheel on the floor */
-    uint32_t contacts; /* how often it has run into a wall */
+    uint32_t contacts; /* how often it has run into a wall or another robot */
     double impact;     /* m/s, the fastest of these */
-    double least;      /* m, between body and nearest wall, the least so far */
+    double least;      /* m, between body and the nearest of these, the least so far */
     bool touching;
     uint64_t stream; /* of random numbers */
 };
@@ -107,16 +109,22 @@ bool wheeled_check(const struct wheeled_parameters *parameters, const double *wa
 void wheeled_begin(struct wheeled *robot, const struct wheeled_parameters *parameters, const double *walls,
                    size_t count);
 
+/* Where another robot is from now on; false, and nothing happens, where there are WHEELED_OTHERS. */
+bool wheeled_meet(struct wheeled *robot, double x, double y);
+
+/* No other robot is there any more. */
+void wheeled_part(struct wheeled *robot);
+
 /* Let time pass with these demands; false, and nothing happens, where it is negative or too long. */
 bool wheeled_advance(struct wheeled *robot, int64_t duration_ns, const struct wheeled_demand demand[WHEELED_AXES]);
 
 /* What the encoder of an axis counts. */
 int32_t wheeled_counts(const struct wheeled *robot, int axis);
 
-/* Distance from body to the nearest wall; negative inside one's reach, infinite without walls. */
+/* Distance from body to the nearest wall or robot; negative inside one's reach, infinite where there are none. */
 double wheeled_nearest(const struct wheeled *robot);
 
-/* True range in one direction from the scanner, in m; infinite where there is no wall. */
+/* True range in one direction from the scanner, in m; infinite where there is nothing. */
 double wheeled_cast(const struct wheeled *robot, double bearing);
 
 /* A scan in mm as a URG-04LX tells it, with noise: 0 where nothing is measured. */

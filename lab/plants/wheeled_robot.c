@@ -8,7 +8,7 @@
 struct robot {
     struct fl_doubles figures, walls;
     double scan_period;
-    int64_t cluster;
+    int64_t cluster, others;
 };
 
 /* As doubles in the order of wheeled_ranges: who writes the task has them from a file, by name. */
@@ -18,9 +18,11 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct robot, scan_period, .default_value = "0.1", .min = 1e-3, .max = 10, .unit = "s"),
     FL_PARAMETER(struct robot, cluster, .default_value = "1", .min = 1, .max = WHEELED_STEPS,
                  .summary = "steps that make one of `ranges`, the shortest of them"),
+    FL_PARAMETER(struct robot, others, .default_value = "0", .max = WHEELED_OTHERS,
+                 .summary = "robots of its kind that may be in the room"),
 };
 
-enum { TARGET, ENABLE, FAULT, MODE };
+enum { TARGET, ENABLE, FAULT, MODE, OTHERS, THERE };
 static const struct fl_port inputs[] = {
     {.name = "target",
      .type = FL_DOUBLE,
@@ -49,9 +51,9 @@ static const struct fl_port outputs[] = {
     {.name = "pose", .type = FL_DOUBLE, .width = 3, .unit = "m, m, rad", .summary = "x, y, heading; as it is"},
     {.name = "motion", .type = FL_DOUBLE, .width = 2, .unit = "m/s, rad/s", .summary = "as it is"},
     {.name = "slip", .type = FL_DOUBLE, .width = 2, .unit = "m/s", .summary = "of each wheel on the floor"},
-    {.name = "contacts", .type = FL_UINT32, .width = 1, .summary = "how often it has run into a wall"},
+    {.name = "contacts", .type = FL_UINT32, .width = 1, .summary = "how often it has run into a wall or a robot"},
     {.name = "impact", .type = FL_DOUBLE, .width = 1, .unit = "m/s", .summary = "the fastest of these"},
-    {.name = "least", .type = FL_DOUBLE, .width = 1, .unit = "m", .summary = "least distance to a wall so far"},
+    {.name = "least", .type = FL_DOUBLE, .width = 1, .unit = "m", .summary = "least distance to these so far"},
     {.name = "scans", .type = FL_UINT32, .width = 1, .summary = "taken so far"},
     {.name = "millimetres",
      .type = FL_UINT16,
@@ -83,6 +85,21 @@ static int configure(struct fl_block *block)
     memcpy(&figures, set->figures.value, sizeof figures);
     if (!wheeled_check(&figures, set->walls.value, set->walls.count / 4, why, sizeof why))
         return fl_fail(block, "parameter %s", why);
+    if (set->others) {
+        struct fl_port others = {.name = "others",
+                                 .type = FL_DOUBLE,
+                                 .width = (uint32_t)(3 * set->others),
+                                 .flags = FL_DELAYED,
+                                 .unit = "m, m, rad",
+                                 .summary = "pose of each other robot"};
+        struct fl_port there = {.name = "there",
+                                .type = FL_BOOLEAN,
+                                .width = (uint32_t)set->others,
+                                .flags = FL_DELAYED,
+                                .summary = "1: this one is in the room"};
+        if (fl_add_input(block, others) != FL_OK || fl_add_input(block, there) != FL_OK)
+            return FL_FAILED;
+    }
     return fl_add_output(block, (struct fl_port){.name = "ranges",
                                                  .type = FL_DOUBLE,
                                                  .width = range_count(set),
@@ -117,6 +134,18 @@ static void demands(struct fl_block *block, struct wheeled_demand demand[WHEELED
     }
 }
 
+static void meet(struct fl_block *block)
+{
+    const struct robot *set = block->parameters;
+    struct state *state = block->state;
+    wheeled_part(&state->robot);
+    for (int64_t i = 0; i < set->others; i++) {
+        const double *pose = (const double *)block->in[OTHERS] + 3 * i;
+        if (((const uint8_t *)block->in[THERE])[i])
+            wheeled_meet(&state->robot, pose[0], pose[1]);
+    }
+}
+
 static void scan(struct fl_block *block)
 {
     const struct robot *set = block->parameters;
@@ -146,6 +175,7 @@ static int step(struct fl_block *block)
     int64_t passed_ns = block->step ? block->release_ns - state->moved_ns : 0;
     state->moved_ns = block->release_ns;
     demands(block, demand);
+    meet(block);
     if (!wheeled_advance(robot, passed_ns, demand))
         return fl_fail(block, "the robot cannot be moved over %g s at once", 1e-9 * (double)passed_ns);
     for (int i = 0; i < WHEELED_AXES; i++) {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +67,43 @@ def fleet() -> Fleet:
     return inventory.load_fleet(INVENTORY)
 
 
-def task(course: Course, described: Fleet) -> dict[str, Any]:
-    """The whole as one task."""
+def task(courses: Sequence[Course], described: Fleet) -> dict[str, Any]:
+    """The whole as one task. Of several courses each is another robot's, in the room of the first."""
+    blocks = _blocks(courses[0], described)
+    if len(courses) > 1:
+        blocks = {}
+        for index, course in enumerate(courses):
+            own = _blocks(replace(course, room=courses[0].room), described)
+            blocks |= {_of(index, name): _renamed(block, index) for name, block in own.items()}
+        for index in range(len(courses)):
+            _meet(blocks, index, [other for other in range(len(courses)) if other != index])
+    return {"period": f"{PERIOD_S:g} s", "priority": 0, "blocks": blocks}
+
+
+def _of(index: int, name: str) -> str:
+    """A block's name, or a signal's, of one of several robots."""
+    return f"robot{index}_{name}"
+
+
+def _renamed(block: dict[str, Any], index: int) -> dict[str, Any]:
+    wires = {port: _of(index, wire) if isinstance(wire, str) else wire for port, wire in block.get("in", {}).items()}
+    return block | ({"in": wires} if wires else {})
+
+
+def _meet(blocks: dict[str, Any], index: int, others: Sequence[int]) -> None:
+    """Let a robot see others, where they were in the step before."""
+    poses = [f"{_of(other, 'robot')}.pose[{axis}]" for other in others for axis in range(3)]
+    for name, kind, wires in (("others", "double", poses), ("there", "boolean", [1] * len(others))):
+        blocks[_of(index, name)] = {
+            "type": "join",
+            "in": {f"in{i}": wire for i, wire in enumerate(wires)},
+            "parameters": {"inputs": len(wires), "type": kind},
+        }
+        blocks[_of(index, "robot")]["in"][name] = f"{_of(index, name)}.out"
+    blocks[_of(index, "robot")]["parameters"]["others"] = len(others)
+
+
+def _blocks(course: Course, described: Fleet) -> dict[str, Any]:
     tasks = identity.control_tasks(described, described.robot_with("drive"))
     blocks: dict[str, Any] = {}
     wires = _wires()
@@ -101,7 +136,7 @@ def task(course: Course, described: Fleet) -> dict[str, Any]:
             "cluster": 4,
         },
     }
-    return {"period": f"{PERIOD_S:g} s", "priority": 0, "blocks": blocks}
+    return blocks
 
 
 def _wires() -> dict[str, dict[str, object]]:
@@ -165,12 +200,25 @@ WATCHED = {
 
 def drive(course: Course, command: Sequence[str | Path], directory: Path, described: Fleet | None = None) -> list[Row]:
     """What was after each step. `command`: flotilla-run with the plant's blocks."""
+    (rows,) = drive_together([course], command, directory, described)
+    return rows
+
+
+def drive_together(
+    courses: Sequence[Course], command: Sequence[str | Path], directory: Path, described: Fleet | None = None
+) -> list[list[Row]]:
+    """Several robots in the room of the first course, for as long as that: each one's rows. They see each other."""
     file = directory / "wheeled.yml"
-    file.write_text(yaml.safe_dump(task(course, described or fleet())))
-    steps = round(course.seconds / PERIOD_S)
-    argv = [*command, "--no-wait", "--steps", str(steps), "--watch", ",".join(WATCHED.values()), file]
+    file.write_text(yaml.safe_dump(task(courses, described or fleet())))
+    steps = round(courses[0].seconds / PERIOD_S)
+    watched = [
+        {name: _of(index, signal) if len(courses) > 1 else signal for name, signal in WATCHED.items()}
+        for index in range(len(courses))
+    ]
+    watch = ",".join(signal for each in watched for signal in each.values())
+    argv = [*command, "--no-wait", "--steps", str(steps), "--watch", watch, file]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=600, check=False)
     if done.returncode:
         raise RuntimeError(f"{paths.shown(file)}: status {done.returncode}: {done.stderr}")
     lines = [json.loads(line) for line in done.stdout.splitlines()]
-    return [{name: line[signal] for name, signal in WATCHED.items()} for line in lines]
+    return [[{name: line[signal] for name, signal in each.items()} for line in lines] for each in watched]

@@ -43,7 +43,7 @@ from lab.qemu.timing import Deadline, Expired
 from lab.scenarios.virtual import PLANT
 from lab.wheeled import plant
 from lab.wheeled.by_wires import INVENTORY
-from lab.wheeled.plant import BITRATE, Plant
+from lab.wheeled.plant import BITRATE, Plant, Room
 from lab.wheeled.virtual import CAN_BOARDS, COMMAND_PORT, DRIVES, LASER
 
 DIRECTORY = paths.BUILD / "wheeled"
@@ -157,11 +157,13 @@ def udp_to(address: bytes, frame: bytes) -> tuple[int, bytes] | None:
     Nothing that robots report is so long that it comes in fragments.
     """
     packet = frame[14:]
-    if len(packet) < 28 or frame[12:14] != b"\x08\x00" or packet[0] >> 4 != 4 or packet[9] != socket.IPPROTO_UDP:
+    if len(packet) < 20 or frame[12:14] != b"\x08\x00" or packet[0] >> 4 != 4 or packet[9] != socket.IPPROTO_UDP:
         return None
     if packet[16:20] != address or int.from_bytes(packet[6:8]) & 0x3FFF:  # a fragment
         return None
     begin = 4 * (packet[0] & 0xF)
+    if len(packet) < begin + 8:
+        return None
     port, length = struct.unpack_from(">2xHH", packet, begin)
     return port, packet[begin + 8 : begin + length]
 
@@ -288,7 +290,9 @@ def _bring(live: Live, fleet: Fleet, index: int, there: Plant) -> None:
     """The plant into a guest."""
     one = live.robots[index]
     board = fleet.boards[one.robot.board]
-    task = plant.task(there, DRIVES, LASER, station=str(fleet.stations[0].address))
+    others = {each.number: str(each.address) for each in fleet.robots.values() if each.number != one.robot.number}
+    station = str(fleet.stations[0].address)
+    task = plant.task(there, DRIVES, LASER, station=station, room=Room(one.robot.number, others))
     with progress.step(f"plant of {one.robot.name}"):
         one.shell.run(["mkdir", "-p", _THERE])
         one.shell.write(f"{_THERE}/plant.so", runtime.compile_plugin(PLANT, board.architecture))

@@ -48,6 +48,24 @@ class Trouble:
     """EMCY error code: overcurrent."""
 
 
+POSE_PORT = 5080
+"""Others' poses come to this UDP port and the other's number."""
+POSE_STEPS = 10
+"""Between two of them."""
+AWAY_S = 10.0
+"""A robot whose plant is silent for so long is not in the room any more."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """Who else is in the room, by plants of their own."""
+
+    number: int
+    """This robot's."""
+    others: Mapping[int, str]
+    """Addresses by number."""
+
+
 @dataclass(frozen=True)
 class Plant:
     """Where and how the robot is."""
@@ -61,7 +79,9 @@ class Plant:
 AXES = ("left", "right", "boom")
 
 
-def task(plant: Plant, interface: str, laser: str, priority: int = 40, station: str = "") -> dict[str, Any]:
+def task(
+    plant: Plant, interface: str, laser: str, priority: int = 40, station: str = "", room: Room | None = None
+) -> dict[str, Any]:
     """Drives on a CAN interface, the scanner at the link `laser`. It records, or tells the address `station`.
 
     Of less priority than the robot's tasks and between their releases: devices have processors of their own.
@@ -98,6 +118,10 @@ def task(plant: Plant, interface: str, laser: str, priority: int = 40, station: 
         "unplug": _pulses([(trouble, 1) for trouble in plant.troubles if trouble.what == "scanner"]),
     }
     blocks |= _told(station) if station else _recorded()
+    if room and room.others:
+        blocks["robot"]["in"] |= {"others": "others.out", "there": "there.out"}
+        blocks["robot"]["parameters"]["others"] = len(room.others)
+        blocks |= _together(room)
     for name in AXES:
         blocks[name] = _pulses([(trouble, trouble.code) for trouble in plant.troubles if trouble.what == name])
     return {"period": f"{PERIOD_MS} ms", "phase": "1 ms", "priority": priority, "overruns": 0, "blocks": blocks}
@@ -129,6 +153,35 @@ def _told(station: str) -> dict[str, Any]:
             "parameters": {"address": station, "port": TRUTH_PORT, "length": _fields()[-1].end},
         },
     }
+
+
+def _together(room: Room) -> dict[str, Any]:
+    """Where the robot is, to the others; where they are."""
+    poses = [f"pose{number}.pose[{axis}]" for number in room.others for axis in range(3)]
+    blocks: dict[str, Any] = {
+        "own": {"type": "pack", "every": POSE_STEPS, "in": {"pose": "robot.pose"}, "parameters": _pose()},
+        "to_others": {
+            "type": "udp-send",
+            "every": POSE_STEPS,
+            "in": {"data": "own.out"},
+            "parameters": {"address": list(room.others.values()), "port": POSE_PORT + room.number, "length": 24},
+        },
+    }
+    for number, address in room.others.items():
+        blocks[f"other{number}"] = {
+            "type": "udp-receive",
+            "parameters": {"port": POSE_PORT + number, "from": address, "length": 24, "timeout": AWAY_S},
+        }
+        blocks[f"pose{number}"] = {"type": "unpack", "in": {"in": f"other{number}.data"}, "parameters": _pose()}
+    there = [f"other{number}.flag" for number in room.others]
+    for name, kind, wires in (("others", "double", poses), ("there", "boolean", there)):
+        ends = {f"in{i}": wire for i, wire in enumerate(wires)}
+        blocks[name] = {"type": "join", "in": ends, "parameters": {"inputs": len(wires), "type": kind}}
+    return blocks
+
+
+def _pose() -> dict[str, Any]:
+    return {"names": ["pose"], "types": ["double"], "widths": [3]}
 
 
 def _all(kind: str, signals: Mapping[str, tuple[str, str, int]], every: int, **parameters: object) -> dict[str, Any]:

@@ -40,9 +40,12 @@ Drive = Callable[[Course], list[Row]]
 def plant(command: list[str | Path], tmp_path: Path) -> Plant:
     """Run the plant alone, its wheels told these speeds."""
 
-    def run(steps: int, speeds: list[float], *, walls: list[float] | None = None, **changes: Any) -> list[Row]:
+    def run(
+        steps: int, speeds: list[float], *, walls: list[float] | None = None, others: list[float] | None = None,
+        there: bool = True, **changes: Any,
+    ) -> list[Row]:  # fmt: skip
         figures = {"range_noise": 0, "range_noise_relative": 0} | changes
-        blocks = {
+        blocks: dict[str, Any] = {
             "target": {
                 "type": "join",
                 "in": {f"in{i}": speed for i, speed in enumerate(speeds)},
@@ -58,6 +61,13 @@ def plant(command: list[str | Path], tmp_path: Path) -> Plant:
                 "parameters": {"inputs": 3, "type": "boolean"},
             },
         }  # fmt: skip
+        if others:
+            blocks["others"] = {
+                "type": "join", "in": {f"in{i}": number for i, number in enumerate(others)},
+                "parameters": {"inputs": len(others)},
+            }  # fmt: skip
+            blocks["robot"]["in"] |= {"others": "others.out", "there": int(there)}
+            blocks["robot"]["parameters"] |= {"others": len(others) // 3}
         path = tmp_path / "task.yml"
         path.write_text(yaml.safe_dump({"period": "10 ms", "priority": 0, "blocks": blocks}))
         names = ("pose", "motion", "slip", "contacts", "impact", "least", "position", "millimetres")
@@ -122,6 +132,27 @@ def test_what_is_too_far_is_not_measured(plant: Plant) -> None:
     scan = plant(1, [0, 0, 0], walls=[5.7, -9, 5.7, 9], initial_pose=[0, 0, 0])[0]["millimetres"]
     assert scan[384 - 44] == 5550
     assert set(scan[:200]) == {0}
+
+
+def test_it_sees_another_robot_and_runs_into_it(plant: Plant) -> None:
+    """A disc of its own size, 3 m ahead and a little to the left; the first scan lacks it. Seen to fail with a disc
+    without radius."""
+    radius, scanner = FIGURES["body_radius"], FIGURES["scanner_x"]
+    there = {"others": [3, 0.1, 0], "walls": BOX}
+    scan = plant(12, [0, 0, 0], **there)[-1]["millimetres"]
+    assert scan[384 - 44] == pytest.approx(1e3 * (3 - scanner - math.sqrt(radius**2 - 0.1**2)), abs=0.51)
+    aside = math.atan2(0.1, 3 - scanner) + math.asin(radius / math.hypot(0.1, 3 - scanner))
+    step = 384 - 44 + math.floor(aside * 1024 / math.tau)
+    assert scan[step] < 3000, "its left edge"
+    assert scan[step + 1] > 3500, "the wall beside it"
+    row = plant(1000, [5, 5, 0], **there)[-1]
+    assert row["contacts"] >= 1
+    assert math.hypot(3 - row["pose"][0], 0.1 - row["pose"][1]) == pytest.approx(2 * radius, abs=0.01)
+
+
+def test_a_robot_that_is_not_there_is_not_seen(plant: Plant) -> None:
+    scan = plant(12, [0, 0, 0], others=[3, 0, 0], there=False, walls=BOX)[-1]["millimetres"]
+    assert scan[384 - 44] == 4000 - 150
 
 
 def test_a_wall_stops_it(plant: Plant) -> None:
@@ -265,6 +296,41 @@ def test_no_wheel_drives_alone(drive: Drive, side: str) -> None:
     assert rows[299]["motion"][0] > 0.49
     assert all(abs(row["motion"][0]) < 0.01 and abs(row["motion"][1]) < 0.02 for row in rows[400:590])
     assert rows[-1]["motion"][0] > 0.4
+
+
+TOWARDS = [{"initial_pose": [0, 0.0, 0]}, {"initial_pose": [3.5, 0.05, math.pi]}]
+"""Two robots that look at each other."""
+
+
+@pytest.fixture
+def drive_together(command: list[str | Path], tmp_path: Path) -> Callable[..., list[list[Row]]]:
+    return lambda *courses: by_wires.drive_together(courses, command, tmp_path)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3, 0.5], ids=lambda speed: f"other at {speed} m/s")
+def test_two_robots_stop_before_each_other(drive_together: Callable[..., list[list[Row]]], speed: float) -> None:
+    """One at 0.5 m/s, one that waits or comes towards it. Seen to fail without the wires from one to the other."""
+    both = drive_together(
+        *(
+            Course(12, [*BY_HAND, Command(1, v)], figures=figures)
+            for v, figures in zip((0.5, speed), TOWARDS, strict=True)
+        )
+    )
+    ends = [rows[-1] for rows in both]
+    gap = math.dist(*(end["pose"][:2] for end in ends)) - 2 * FIGURES["body_radius"]
+    print(f"{1e3 * gap:.0f} mm between them, {1e3 * min(end['least'] for end in ends):.0f} mm at the least")
+    assert all(end["contacts"] == 0 for end in ends)
+    assert min(end["least"] for end in ends) > 0
+    assert max(row["motion"][0] for row in both[0]) > 0.49
+    assert all(abs(end["motion"][0]) < 0.01 for end in ends)
+    assert both[0][-1]["limited"]
+    assert gap < 0.5, "they stop a long way off"
+
+
+def test_robots_that_do_not_see_each_other_collide(drive: Drive, tmp_path: Path) -> None:
+    """So the ones above would."""
+    rows = drive(Course(12, [*BY_HAND, Command(1, 0.5)], figures=TOWARDS[0]))
+    assert max(row["pose"][0] for row in rows) > 3.5 - 2 * FIGURES["body_radius"]
 
 
 def test_a_drive_repeats(drive: Drive) -> None:

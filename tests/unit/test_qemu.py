@@ -144,6 +144,21 @@ def test_user_network_knows_the_fleet_and_lets_nothing_out() -> None:
     assert "i82559er,id=nic,mac=52:54:00:f1:00:03,romfile=,netdev=net" in values(argv, "-device")
 
 
+def test_time_is_the_hosts_unless_asked() -> None:
+    assert not values(command_line(board()), "-icount")
+    argv = command_line(board(), steady=True)
+    assert values(argv, "-icount") == ["shift=3,sleep=on,align=on"]
+    assert values(argv, "-accel") == ["tcg,thread=single"]
+
+
+def test_datagrams_come_in_by_an_address_and_none_goes_out() -> None:
+    guest, station = IPv4Address("10.42.0.3"), IPv4Address("10.42.0.254")
+    inward = {(guest, 5030): ("127.43.1.3", 5031)}
+    arguments = qemu.user_netdev("net", NETWORK.subnet, station, {}, inward=inward).split(",")
+    assert "hostfwd=udp:127.43.1.3:5031-10.42.0.3:5030" in arguments
+    assert "restrict=on" in arguments
+
+
 def test_user_network_with_datagrams_lets_guests_reach_the_station() -> None:
     station, guest = IPv4Address("10.42.0.254"), IPv4Address("10.42.0.3")
     arguments = qemu.user_netdev("net", NETWORK.subnet, station, {}, {(guest, 5010): 4711}).split(",")
