@@ -61,7 +61,7 @@ class Browser:
             argv = [_PROGRAM, *_OPTIONS, f"--user-data-dir={home}", "--remote-debugging-port=0", "about:blank"]
             process = on_failure.enter_context(subprocess.Popen(argv, stderr=subprocess.PIPE, text=True))
             on_failure.callback(process.kill)
-            self._socket = on_failure.enter_context(connect(_address(process), max_size=None))
+            self._socket = on_failure.enter_context(connect(_address(process), max_size=None, ping_interval=None))
             self._closing = on_failure.pop_all()
         return self
 
@@ -161,7 +161,8 @@ class Page:
     def until(self, expression: str, timeout_s: float = _TIMEOUT_S) -> Any:
         """Look at each frame, until the expression is true; its value."""
         end = time.monotonic() + timeout_s
-        while not (found := self.value(expression)):
+        test = f"(found => found instanceof Node || found)({expression})"  # an element has no value
+        while not (found := self.value(test)):
             assert time.monotonic() < end, f"not within {timeout_s} s: {expression}\n{self.text()}\n{self.complaints}"
             self.value("new Promise(resolve => setTimeout(resolve, 30))")
         return found

@@ -1,5 +1,5 @@
-"""What tests of the station's page need: the program, a browser's view of it, a client that is none, and a robot that is
-driven without a guest."""
+"""What tests of the station's page need: the program, a client that is no browser, and a robot that is driven without a
+guest."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from flotilla.common.signals import CODES
@@ -67,11 +68,24 @@ class Client:
         sent = {"Origin": f"http://{host}", "Cookie": f"flotilla-{host.rpartition(':')[2]}={token}"} | headers
         self.socket: ClientConnection = connect(
             f"ws://{host}/socket", additional_headers={name: value for name, value in sent.items() if value},
-            max_size=None, compression=None, ping_interval=None,
+            max_size=None, compression=None, ping_interval=None, legacy=True,
         )  # fmt: skip
 
     def send(self, **request: object) -> None:
         self.socket.send(json.dumps(request))
+
+    def flood(self, request: str | bytes, count: int) -> tuple[int, int, str]:
+        """Send it so often, or until the station closes the connection: how often it was, then the close's code and
+        reason."""
+        sent = 0
+        try:
+            while sent < count:
+                self.socket.send(request)
+                sent += 1
+            while True:
+                self.socket.recv(PATIENCE)
+        except ConnectionClosed as closed:
+            return sent, closed.rcvd.code if closed.rcvd else 0, closed.rcvd.reason if closed.rcvd else ""
 
     def until(self, what: Callable[[dict[str, Any]], Any]) -> Any:
         """The first message that it is true of."""

@@ -22,7 +22,7 @@ from flotilla.fleet.model import Fleet, Robot
 from flotilla.robot import parameters, scope
 from flotilla.station import page_requests as asked
 from flotilla.station import watching
-from flotilla.station.driving import Driving, Operator
+from flotilla.station.driving import Driving
 from flotilla.station.receiver import Receiver
 from flotilla.station.record import Recorder
 from flotilla.station.recording import Value
@@ -335,8 +335,11 @@ class Desk:
     def _set(self, session: Session, request: asked.SetParameter) -> None:
         told = f"browser {session.number}: {request.robot} {request.task} {request.parameter}"
         self._ask(
-            session, request, lambda robot: parameters.param(robot, request.task, request.parameter, request.value), told
-        )  # fmt: skip
+            session,
+            request,
+            lambda robot: parameters.param(robot, request.task, request.parameter, request.value),
+            told,
+        )
 
     def _service(self, session: Session, request: asked.Service) -> None:
         told = f"browser {session.number}: {request.action} {request.robot} {request.task}"

@@ -106,8 +106,8 @@ class Play(_Request):
 
 
 class Driving(_Request):
-    """Who drives a robot: `take` it if nobody does, `ask` who does for it, `offer` it to another browser, `accept` what is
-    offered, `release` it."""
+    """Who drives a robot: `take` it if nobody does, `ask` who does for it, `offer` it to another browser, `accept` what
+    is offered, `release` it."""
 
     do: Literal["take", "ask", "offer", "accept", "release"]
     robot: Name

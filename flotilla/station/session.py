@@ -36,8 +36,8 @@ _BROKEN = {
 
 
 class Session:
-    """`number`: other browsers know it by this. `note`: says what an operator has to know, on terminal and page. `abort`:
-    ends the connection at once."""
+    """`number`: other browsers know it by this. `note`: says what an operator has to know, on terminal and page.
+    `abort`: ends the connection at once."""
 
     def __init__(
         self,

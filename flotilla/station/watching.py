@@ -1,5 +1,5 @@
-"""Rows of signals of a running task, as they come: the robot's own `flotilla-scope` by ssh, which ends with its stdin, so
-that no watcher stays on the robot when a page, this program or the connection goes."""
+"""Rows of signals of a running task, as they come: the robot's own `flotilla-scope` by ssh, which ends with its stdin,
+so that no watcher stays on the robot when a page, this program or the connection goes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def rows(robot: Robot, command: Sequence[str], signals: Sequence[str]) -> 
     assert process.stdin
     assert process.stdout
     assert process.stderr
-    complaints = asyncio.create_task(process.stderr.read(_LINE_BYTES))
+    complaints = asyncio.create_task(_said(process.stderr))
     batch: asyncio.Queue[list[Any] | None] = asyncio.Queue(_BATCH_ROWS)
     reading = asyncio.create_task(_read(process.stdout, signals, batch))
     try:
@@ -86,9 +86,17 @@ async def _read(lines: asyncio.StreamReader, signals: Sequence[str], batch: asyn
     await batch.put(None)
 
 
+async def _said(stream: asyncio.StreamReader) -> bytes:
+    """All of it, or its beginning where that is longer than anything that makes sense."""
+    said = b""
+    while chunk := await stream.read(_LINE_BYTES):
+        said += chunk[: _LINE_BYTES - len(said)]
+    return said
+
+
 def words(
-    task: str, signals: Sequence[str], *, period_s: float | None, at_least: int | None, trigger: str | None, before: int,
-    count: int,
+    task: str, signals: Sequence[str], *, period_s: float | None, at_least: int | None, trigger: str | None,
+    before: int, count: int,
 ) -> list[str]:  # fmt: skip
     """The command on the robot. With a trigger, each step has a row and `count` end it."""
     steps = (at_least or 1) if trigger else max(at_least or 1, every(period_s))

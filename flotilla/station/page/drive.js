@@ -14,7 +14,7 @@ const KEYS = {
 };
 const BOOM_KEYS = { KeyE: 1, KeyQ: -1 };
 const FLAGS = [
-  ["alive", "commands come", "no commands"], ["seeing", "sees", "sees nothing"], ["limited", "slowed by what it sees", ""],
+  ["conflict", "several operators command", ""], ["alive", "commands come", "no commands"], ["seeing", "sees", "sees nothing"], ["limited", "slowed by what it sees", ""],
   ["left", "left motor on", "left motor off"], ["right", "right motor on", "right motor off"],
   ["boom_enabled", "boom on", "boom off"],
 ];
@@ -179,7 +179,7 @@ export class Drive {
     if (document.activeElement !== this.boom) this.boom.value = this.#boom;
     const chips = FLAGS.filter(([name]) => name in values).map(([name, on, off]) => {
       const is = values[name];
-      if (name === "limited") return is ? [on, "warn"] : null;
+      if (!off) return is ? [on, name === "conflict" ? "bad" : "warn"] : null;
       return [is ? on : off, is ? "good" : name === "seeing" ? "bad" : ""];
     });
     for (const side of ["left", "right", "boom"]) {
