@@ -229,8 +229,8 @@ bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HA
 	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(call option,--seconds,SECONDS) \
 	    $(call option,--rounds,ROUNDS)
 
-station: | setup ## a page to see the fleet, drive, tune and record it [PORT=8080 ADDRESS=127.0.0.1 OUT=file]; show a recording: REPLAY=file
-	$(Q)$(FLOTILLA) station $(call option,--port,PORT) $(call option,--page-address,ADDRESS) $(call option,--record,OUT) \
+station: | setup ## a page to see the fleet, drive, tune and record it [PORT=8080 ADDRESS=127.0.0.1 OUT=file INVENTORY=]; show a recording: REPLAY=file
+	$(Q)$(FLOTILLA) station $(call option,--inventory,INVENTORY) $(call option,--port,PORT) $(call option,--page-address,ADDRESS) $(call option,--record,OUT) \
 	    $(call option,--replay,REPLAY) $(call option,--seconds,SECONDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
