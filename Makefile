@@ -141,7 +141,6 @@ test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU; one tier 
 	    $(PYTHON) -m tests.costs show $(COSTS); exit $$status
 
 test-all: test ## the same, and tests that take minutes for one answer
-	$(Q)images/install-host-packages tests/browser-packages.txt
 	$(Q)$(MAKE) test TIER=nightly
 
 .PHONY: test-kernel test-clock test-others

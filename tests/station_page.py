@@ -65,7 +65,7 @@ class Client:
     """Speaks to the station's WebSocket and is no browser. `headers`: in place of the usual ones."""
 
     def __init__(self, host: str, token: str, headers: Mapping[str, str]) -> None:
-        sent = {"Origin": f"http://{host}", "Cookie": f"flotilla-{host.rpartition(':')[2]}={token}"} | headers
+        sent = {"Origin": f"http://{host}", "Cookie": f"flotilla-{host.rpartition(':')[2]}={token}"} | dict(headers)
         self.socket: ClientConnection = connect(
             f"ws://{host}/socket", additional_headers={name: value for name, value in sent.items() if value},
             max_size=None, compression=None, ping_interval=None, legacy=True,

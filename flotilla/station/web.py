@@ -45,7 +45,7 @@ class Web:
 
     async def begin(self) -> str:
         """Listen; the page's address, with the token."""
-        app = web.Application(middlewares=[self._guard()], client_max_size=LONGEST)
+        app = web.Application(middlewares=[self._guard], client_max_size=LONGEST)
         app.router.add_get("/socket", self._socket)
         app.router.add_get("/{file:.*}", self._file)
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1)
@@ -62,23 +62,20 @@ class Web:
     async def end(self) -> None:
         await self._runner.cleanup()
 
-    def _guard(self) -> Callable[[web.Request, Handler], Awaitable[web.StreamResponse]]:
-        @web.middleware
-        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-            try:
-                self._access.check(
-                    request.headers,
-                    request.cookies.get(self._access.cookie, ""),
-                    request.query.get("token", ""),
-                    socket=request.path == "/socket",
-                )
-            except RefusedError as error:
-                self._note_refused(request, f"{error}")
-                text = f"{error}.\nOpen the address that the station printed when it started: it has the token.\n"
-                return web.Response(status=403, text=text, headers=HEADERS)
-            return await handler(request)
-
-        return guard
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        try:
+            self._access.check(
+                request.headers,
+                request.cookies.get(self._access.cookie, ""),
+                request.query.get("token", ""),
+                socket=request.path == "/socket",
+            )
+        except RefusedError as error:
+            self._note_refused(request, f"{error}")
+            text = f"{error}.\nOpen the address that the station printed when it started: it has the token.\n"
+            return web.Response(status=403, text=text, headers=HEADERS)
+        return await handler(request)
 
     def _note_refused(self, request: web.Request, reason: str) -> None:
         """At most once a second: whoever asks sets the pace."""

@@ -7,6 +7,7 @@ stops its tasks. What needs no guest is in tests/runtime/test_station_page.py.
 
 from __future__ import annotations
 
+import functools
 import json
 import statistics
 import time
@@ -89,6 +90,11 @@ def rests(there: Live) -> None:
     there.until(lambda: max(map(abs, there.report()["motion"])) < 0.01, PATIENCE_S, "it is at rest")
 
 
+def turns(there: Live, left: int) -> bool:
+    """Whether its wheels are to: 1 to the left, −1 to the right."""
+    return bool(there.report()["wanted"][1] * left > 0)
+
+
 def test_keys_move_the_real_tasks(
     driver: Page, there: Live, artefacts: Path, record_property: Callable[[str, object], None]
 ) -> None:
@@ -108,7 +114,7 @@ def test_keys_move_the_real_tasks(
         left = 1 if number % 2 == 0 else -1
         begun = time.monotonic()
         driver.key("ArrowLeft" if left > 0 else "ArrowRight", True)
-        there.until(lambda left=left: there.report()["wanted"][1] * left > 0, PATIENCE_S, "it turns")
+        there.until(functools.partial(turns, there, left), PATIENCE_S, "it turns")
         took_ms.append(1000 * (time.monotonic() - begun))
         driver.key("ArrowLeft" if left > 0 else "ArrowRight", False)
         there.until(lambda: there.report()["wanted"][1] == 0, PATIENCE_S, "it is to rest")
@@ -170,8 +176,8 @@ def test_ten_thousand_commands_a_second_leave_it_safe(
 
 
 def test_signals_parameters_and_stop_all(page: Page, there: Live, artefacts: Path) -> None:
-    """A wire of the running task is plotted, a parameter of it set, and all tasks stop. Seen to fail with a task that is
-    not there, and with a service's name that is wrong."""
+    """A wire of the running task is plotted, a parameter of it set, and all tasks stop. Seen to fail with a service's
+    name that is wrong."""
     page.click("#add-plot")
     page.until("document.querySelector('#source')")
     page.value(

@@ -7,6 +7,7 @@ One station, one browser and one robot for all tests; each leaves the robot at r
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import statistics
@@ -147,6 +148,11 @@ def test_the_fleet_is_shown(page: Page, served: Station, robot: WheeledRobot, ar
     assert page.value("location.search") == "", "the token stays in the address"
 
 
+def turning(robot: WheeledRobot, count: int) -> list[tuple[float, int, int, float, float, float, bool]]:
+    """Its commands after so many that are to turn it."""
+    return [each for each in robot.commands[count:] if each[4]]
+
+
 def test_keys_drive_the_robot(
     driver: Page, robot: WheeledRobot, record_property: Callable[[str, object], None]
 ) -> None:
@@ -164,7 +170,7 @@ def test_keys_drive_the_robot(
     for _ in range(TAKEN):
         count, begun = len(robot.commands), time.monotonic()
         driver.key("ArrowLeft", True)
-        moved = until(lambda count=count: [each for each in robot.commands[count:] if each[4]], "it turns")
+        moved = until(functools.partial(turning, robot, count), "it turns")
         took_ms.append(1000 * (moved[0][0] - begun))
         driver.key("ArrowLeft", False)
         until(lambda: not robot.moves, "it rests")
