@@ -151,7 +151,6 @@ test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU; one tier 
 	    $(PYTHON) -m tests.costs show $(COSTS); exit $$status
 
 test-all: test ## the same, and tests that take minutes for one answer
-	$(Q)images/install-host-packages tests/browser-packages.txt
 	$(Q)$(MAKE) test TIER=nightly
 
 .PHONY: test-kernel test-clock test-others
@@ -205,7 +204,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param scope record live top drive report
+.PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive report
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -238,6 +237,10 @@ bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HA
 	$(Q)images/install-host-packages runtime/bench/packages.txt
 	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(call option,--seconds,SECONDS) \
 	    $(call option,--rounds,ROUNDS)
+
+station: | setup ## a page to see the fleet, drive, tune and record it [PORT=8080 ADDRESS=127.0.0.1 OUT=file INVENTORY=]; show a recording: REPLAY=file
+	$(Q)$(FLOTILLA) station $(call option,--inventory,INVENTORY) $(call option,--port,PORT) $(call option,--page-address,ADDRESS) $(call option,--record,OUT) \
+	    $(call option,--replay,REPLAY) $(call option,--seconds,SECONDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
 station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)

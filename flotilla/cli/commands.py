@@ -378,6 +378,18 @@ def _drive_arguments(parser: argparse.ArgumentParser) -> None:
     drive.drive_arguments(parser)
 
 
+def _page(arguments: argparse.Namespace) -> None:
+    from flotilla.station import page_command
+
+    page_command.run(arguments)
+
+
+def _page_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import page_command
+
+    page_command.page_arguments(parser)
+
+
 def _report(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths
     from flotilla.station import report
@@ -437,6 +449,7 @@ COMMANDS = (
     Command("Robots", "releases", "show which release each robot runs", _releases, _releases_arguments),
     Command("Robots", "hwcheck", "report a robot's hardware", _hwcheck, _hwcheck_arguments),
     Command("Robots", "provision", "make robots what the inventory says", _provision, _provision_arguments),
+    Command("Robots", "station", "serve a page to see the fleet, drive and record it", _page, _page_arguments),
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
