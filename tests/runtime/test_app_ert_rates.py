@@ -7,6 +7,7 @@ import re
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,7 +35,7 @@ class Run:
     status: int
     said: str
     rows: list[dict[str, float]]
-    rates: list[dict[str, int]]
+    rates: list[dict[str, Any]]
     overruns: int
 
     @property

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from flotilla.apps import app, ert, imported, scaffold
+from flotilla.common import paths
 from flotilla.common.errors import UserError
 from tests.fixtures import ert_rates
 from tests.fixtures.ert_shapes import SHAPES, write
@@ -45,8 +46,8 @@ def test_an_archive_becomes_an_app_that_runs(archive: Path, flotilla_run: Path) 
     assert (made / app.FILE).read_text() == "kind: ert\nmodel: three\n"
     ert.block(made, "three", "three", [], source := archive.parent / "source", "amd64")
     (blocks := archive.parent / "blocks").mkdir()
-    argv = ["cc", "-shared", "-fPIC", f"-I{scaffold.paths.PROJECT / 'runtime' / 'include'}", "-o", blocks / "three.so"]
-    subprocess.run([*argv, *source.glob("*.c")], check=True)
+    argv = ["cc", "-shared", "-fPIC", f"-I{paths.PROJECT / 'runtime' / 'include'}", "-o", blocks / "three.so"]
+    subprocess.run([*map(str, argv), *map(str, source.glob("*.c"))], check=True)
     run = [flotilla_run, "--blocks", blocks, "--no-wait", "--steps", "3", made / app.TASK]
     done = subprocess.run(list(map(str, run)), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
