@@ -244,7 +244,7 @@ station: | setup ## a page to see the fleet, drive, tune and record it [PORT=808
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
 station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)
-record: | setup ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS=]
+record: | setup ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS= INVENTORY=]
 	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
 
 live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
@@ -253,8 +253,8 @@ live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.
 top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
 	$(Q)$(FLOTILLA) top $(station) $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
 
-drive: | setup ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN]
-	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT)
+drive: | setup ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN] [INVENTORY=]
+	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT) $(call option,--inventory,INVENTORY)
 
 report: | setup ## a page of a recording: paths, commands, hops, latency: make report FILE=run.mcap [OUT=page.html]
 	$(Q)$(FLOTILLA) report $(call need,FILE) $(call option,--out,OUT)
