@@ -13,11 +13,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from flotilla.common import paths
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Releases
 from images.builder import bundle, runtime, slot
 from images.builder.build import BoardBuild
+from lab.staging.virtual import OVERRUN
 
 SEED, NEW_BYTES = 1, 2 << 20
 """What a delta cannot take from what a robot has: about as much as when a library of many programs is replaced."""
@@ -33,7 +33,6 @@ ARGUMENTS: Mapping[str, tuple[str, str]] = {
     "service manager hangs": (PREINIT, "init=/new/freeze"),
 }
 """How bad releases go wrong: a boot argument, and what stands in its place."""
-OVERRUN = paths.PROJECT / "lab/staging/overrun.c"
 FREEZE = """#!/bin/busybox sh
 # The shipped first program, and a fault that the service manager does not survive: it freezes then, and serves nothing.
 (

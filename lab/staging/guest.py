@@ -97,13 +97,15 @@ def card(name: str, session: dict[str, Any], above: int) -> str:
 class Task:
     """The control task, and what it says of itself."""
 
-    def __init__(self, session: dict[str, Any], out: Path) -> None:
+    def __init__(self, session: dict[str, Any], out: Path, library: str = "") -> None:
+        """`library`: what it loads before all others."""
         self.out = out
         out.mkdir()
         argv = ["flotilla-run", "--blocks", session["blocks"], "--statistics", str(out / "statistics.json")]
         argv += ["--control", str(out / "control"), session["task"]]
         with (out / "log").open("wb") as log:
-            self._process = subprocess.Popen(argv, stdout=log, stderr=log, cwd=out)
+            environment = os.environ | ({"LD_PRELOAD": library} if library else {})
+            self._process = subprocess.Popen(argv, stdout=log, stderr=log, cwd=out, env=environment)
 
     def now(self) -> dict[str, Any]:
         """How it does, as `flotilla-param` says; nothing when it has ended, since too many steps were lost."""
@@ -111,8 +113,8 @@ class Task:
         done = subprocess.run(argv, capture_output=True, check=False)
         if done.returncode:
             return {}
-        said = json.loads(done.stdout)
-        return {key: said[key] for key in ("running_s", "steps", "overruns", "skipped")}
+        said: dict[str, Any] = json.loads(done.stdout)
+        return said
 
     def end(self) -> dict[str, Any]:
         """End it: its status, what it wrote, and its statistics."""
@@ -165,11 +167,13 @@ def course(name: str, session: dict[str, Any], above: dict[str, int], out: Path)
     return told
 
 
-def alone(session: dict[str, Any], out: Path) -> dict[str, Any]:
+def alone(session: dict[str, Any], out: Path, library: str = "") -> dict[str, Any]:
     """The task, and no update."""
-    task = Task(session, out / "alone")
+    task = Task(session, out, library)
+    time.sleep(session["alone_s"])
+    before = task.now()
     time.sleep(session["without_s"])
-    return task.end()
+    return {"before": before, "now": task.now()} | task.end()
 
 
 def main(session: dict[str, Any], out: Path) -> dict[str, Any]:
@@ -178,7 +182,8 @@ def main(session: dict[str, Any], out: Path) -> dict[str, Any]:
     try:
         cell(session["robot"], session["station"], session["prefix"])
         data(session["data_mib"])
-        said["alone"] = alone(session, out)
+        said["alone"] = alone(session, out / "alone")
+        said["bad"] = alone(session, out / "bad", session["overrun"])
         for name, above in session["courses"].items():
             said[name] = course(name, session, above, out)
     except Exception:

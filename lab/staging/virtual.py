@@ -29,6 +29,7 @@ from lab.latency import machine, results, subject
 from lab.latency.virtual_loop import CHAIN, PLUGIN
 
 HERE = Path(__file__).parent
+OVERRUN = HERE / "overrun.c"
 DIRECTORY = subject.DIRECTORY
 ROBOT, STATION, PREFIX = "10.43.0.1", "10.43.0.100", 24
 """A network of its own: the wire of the guest leads nowhere."""
@@ -48,7 +49,9 @@ WITHOUT_S = 5.0
 DATA_MIB = 96
 MEMORY_MIB = 512
 """Of the guest, which has its card in memory."""
-ALONE, SHIPPED, RECEIVER, UPDATER = "alone", "shipped", "receiver", "updater"
+ALONE, BAD = "alone", "bad"
+"""The task without an update, and with the library by which tasks of a bad release overrun."""
+SHIPPED, RECEIVER, UPDATER = "shipped", "receiver", "updater"
 ABOVE = 90
 """A real-time priority; the task has 80."""
 COURSES: Mapping[str, Mapping[str, int]] = {
@@ -202,11 +205,12 @@ def stage(board: Board, kbit_s: int, out: Path) -> Staged:
     session = brought.session | {
         "robot": ROBOT, "station": STATION, "prefix": PREFIX, "bit_s": 1000 * kbit_s, "data_mib": DATA_MIB,
         "blocks": str(DIRECTORY), "task": f"{DIRECTORY}/task.yml", "alone_s": ALONE_S, "without_s": WITHOUT_S,
-        "courses": COURSES,
+        "courses": COURSES, "overrun": f"{DIRECTORY}/overrun.so",
     }  # fmt: skip
     files = brought.files | {
         f"{DIRECTORY}/task.yml": CHAIN.format(device=f"/dev/{board.ports[port].tty}").encode(),
         f"{DIRECTORY}/loopback.so": runtime.compile_plugin(PLUGIN, board.architecture),
+        f"{DIRECTORY}/overrun.so": runtime.compile_plugin(OVERRUN, board.architecture),
         f"{DIRECTORY}/guest.py": (HERE / "guest.py").read_bytes(),
         f"{DIRECTORY}/session.json": json.dumps(session).encode(),
     }
