@@ -119,15 +119,19 @@ class Session:
             await self._wake.wait()
             self._wake.clear()
             while self._waiting:
-                await self._send_one(self._waiting.popleft())
+                if not await self._sent(self._waiting.popleft()):
+                    return
             if self._state:
                 state, self._state = self._state, None
-                await self._send_one(state)
+                if not await self._sent(state):
+                    return
 
-    async def _send_one(self, text: str) -> None:
+    async def _sent(self, text: str) -> bool:
+        """False: it is gone."""
         try:
             async with asyncio.timeout(_SEND_S):
                 await self._socket.send_str(text)
         except (TimeoutError, ConnectionError):
             self._abort()
-            raise asyncio.CancelledError from None
+            return False
+        return True
