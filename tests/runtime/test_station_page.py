@@ -12,11 +12,13 @@ import json
 import os
 import socket
 import statistics
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 import pytest
 from websockets.exceptions import InvalidStatus
@@ -67,11 +69,21 @@ def robot(fleet: Path) -> Iterator[WheeledRobot]:
         robot.close()
 
 
+def drain(stream: IO[str]) -> None:
+    """What a task prints: it waits for whoever it prints for."""
+    for _ in stream:
+        pass
+
+
 @pytest.fixture(scope="module")
 def there(flotilla_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A directory of what the robot has: a task that runs, and programs that reach it."""
     directory = tmp_path_factory.mktemp("robot")
     running = Running(flotilla_run, directory)
+    assert running.process.stdout
+    assert running.process.stderr
+    draining = threading.Thread(target=drain, args=(running.process.stdout,))
+    draining.start()
     scripts = {
         "ssh": SSH.format(directory=directory),
         "sudo": '#!/bin/sh\nexec "$@"\n',
@@ -89,7 +101,10 @@ def there(flotilla_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
         yield directory
     finally:
         running.process.kill()
-        running.process.communicate()
+        running.process.wait(PATIENCE)
+        draining.join()
+        running.process.stdout.close()
+        running.process.stderr.close()
 
 
 @pytest.fixture(scope="module")
