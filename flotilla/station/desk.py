@@ -404,11 +404,10 @@ class Desk:
         try:
             if len(own.followers) + len(own.watches) >= WATCHES:
                 raise UserError(f"{WATCHES} plots are the most; close one")
-            rows = own.rows[request.id] = []
+            own.rows[request.id] = []
             own.followers[request.id] = self._view.follow(
                 request.topic, request.signals, lambda row: self._row(session, request.id, row)
             )
-            del rows
             text, good = "", True
         except UserError as error:
             text, good = f"{error}", False

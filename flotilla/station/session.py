@@ -28,7 +28,7 @@ _KEPT = 500
 """Messages that wait for a browser; a slow one loses rows of signals first."""
 _SEND_S = 10
 """A browser that takes nothing for so long is gone."""
-_BROKEN = {
+_BROKEN: dict[int | None, str] = {
     WSCloseCode.PROTOCOL_ERROR: "what is no WebSocket frame",
     WSCloseCode.INVALID_TEXT: "text that is not UTF-8",
     WSCloseCode.MESSAGE_TOO_BIG: f"a request of more than {page_requests.LONGEST} bytes",
@@ -79,14 +79,14 @@ class Session:
         reason = ""
         try:
             async for message in self._socket:
+                if message.type is WSMsgType.ERROR:
+                    reason = _BROKEN.get(getattr(message.data, "code", None), "")
                 if message.type not in (WSMsgType.TEXT, WSMsgType.BINARY):
                     break
                 if reason := self._take(message.data, do):
                     break
                 if self.excess:
                     await asyncio.sleep(0)  # a flood must not keep the loop from all else
-            if self._socket.close_code in _BROKEN:
-                reason = _BROKEN[WSCloseCode(self._socket.close_code)]
         finally:
             sending.cancel()
         if reason:
@@ -119,15 +119,19 @@ class Session:
             await self._wake.wait()
             self._wake.clear()
             while self._waiting:
-                await self._send_one(self._waiting.popleft())
+                if not await self._sent(self._waiting.popleft()):
+                    return
             if self._state:
                 state, self._state = self._state, None
-                await self._send_one(state)
+                if not await self._sent(state):
+                    return
 
-    async def _send_one(self, text: str) -> None:
+    async def _sent(self, text: str) -> bool:
+        """False: it is gone."""
         try:
             async with asyncio.timeout(_SEND_S):
                 await self._socket.send_str(text)
         except (TimeoutError, ConnectionError):
             self._abort()
-            raise asyncio.CancelledError from None
+            return False
+        return True
