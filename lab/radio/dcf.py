@@ -182,7 +182,7 @@ class Cell:
         self.lost: Callable[[int, int, Frame], None] = lambda _time, _sender, _frame: None
         """Time, sender, frame: given up, or not taken by a full queue. A frame to all is never given up."""
         self._timing = timing
-        self._links = links
+        self.links = links
         self._random = random.Random(seed)
         self._events: list[tuple[int, int, Call | None, int, int]] = []
         self._number = 0
@@ -366,9 +366,9 @@ class Cell:
 
         def read(receiver: int) -> bool:
             if sent.beside:
-                error = self._links.error_beside(sent.sender, receiver, rate_bit_s, size, sent.beside)
+                error = self.links.error_beside(sent.sender, receiver, rate_bit_s, size, sent.beside)
             else:
-                error = self._links.error(sent.sender, receiver, rate_bit_s, size)
+                error = self.links.error(sent.sender, receiver, rate_bit_s, size)
             return error <= 0 or (error < 1 and self._random.random() >= error)
 
         return read
@@ -378,7 +378,7 @@ class Cell:
     ) -> None:
         """The channel is idle again, for whoever hears nothing else. `answers`: who sends an ACK after SIFS; whoever
         hears that counts only after it."""
-        links, sender, beside = self._links, sent.sender, sent.beside
+        links, sender, beside = self.links, sent.sender, sent.beside
         busy, waits = self._busy, self._waits
         answered = links.hears[answers] if answers != _NEVER else ()
         for station in self._near[sender]:

@@ -1,7 +1,8 @@
 """The simulated medium against published models of it, and rule by rule.
 
 Seen to fail by planted mistakes: DIFS of one slot less, a window that does not grow, DIFS in place of EIFS, no NAV,
-one attempt more, only the strongest interference, a seed that is not used, and slots that are not kept while another sends.
+one attempt more, only the strongest interference, a seed that is not used, and slots that are not kept while another
+sends.
 """
 
 from __future__ import annotations
