@@ -1,6 +1,8 @@
 """What a fleet sends, by its description, and how many robots a cell carries by simulation and by computation.
 
-XXX
+Seen to fail by planted mistakes: frames without LLC and MAC headers, reports or beacons left out (air by hand), triggers
+that nothing follows, lost steps that do not count, a standby that triggers too, no update, every size carried, DDS
+without its headers, and a seed that is not used.
 """
 
 from __future__ import annotations
@@ -93,8 +95,8 @@ def test_a_fleet_that_sends_nothing_has_no_answer() -> None:
 
 
 def test_air_time_by_hand(four: traffic.Description) -> None:
-    """802.11b, 11 Mbit/s, long preamble, ACK at 2 Mbit/s: frames with 36 bytes of LLC and MAC, 0.625 NTP packets a second,
-    and beacons at 1 Mbit/s."""
+    """802.11b, 11 Mbit/s, long preamble, ACK at 2 Mbit/s: frames with 36 bytes of LLC and MAC, 0.625 NTP packets, and
+    beacons at 1 Mbit/s."""
     sizes = {134: 100, 145: 200, 121: 100, 133: 100, 80: 100, 162: 10, 112: 0.625}
     air = sum(rate * (192 + -(-8 * size // 11) + 10 + 248) for size, rate in sizes.items()) / 1e6
     air += (192 + 8 * (28 + 12 + 2 + 8 + 10 + 3 + 4)) / 102_400
@@ -144,12 +146,12 @@ def test_what_nobody_hears_is_lost_and_counts(four: traffic.Description) -> None
 def test_the_search_ends_where_deadlines_do(four: traffic.Description) -> None:
     told: list[int] = []
     curve = capacity.find(
-        four, B, seconds=2, limit_ms=None, percent=1, done=lambda point: told.append(point.simulated.robots)
+        four, B, seconds=1, limit_ms=None, percent=1, done=lambda point: told.append(point.simulated.robots)
     )
     assert (curve.carries, curve.ends_at) == (4, 8)
     assert told == [point.simulated.robots for point in curve.points] == [4, 8, 12]
-    lenient = capacity.find(four, B, seconds=2, limit_ms=1000, percent=1)
-    assert lenient.carries > 4
+    for limit_ms, percent in ((1000.0, 1.0), (None, 50.0)):
+        assert capacity.measure(four, B, 2, seconds=2, limit_ms=limit_ms, percent=percent).carried
 
 
 def test_a_run_repeats_and_the_seed_counts(four: traffic.Description) -> None:
