@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import random
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 
 from lab.radio import dcf, phy
 from lab.radio.dcf import Cell, Counts, Frame, Links, Timing
@@ -299,6 +299,34 @@ class _Run:
             self.groups, self.groups * self.robots, (self.until_ns - _WARM_NS) / 1e9, counts.frames / passed_s,
             counts.busy_ns / self.cell.now_ns, counts, self.messages, self.chains, silences,
         )  # fmt: skip
+
+
+def merged(results: Sequence[Result]) -> Result:
+    """Of runs of one size: all that they met together."""
+    first = results[0]
+    counts = Counts(
+        **{each.name: sum(getattr(result.counts, each.name) for result in results) for each in fields(Counts)}
+    )
+
+    def together(of: Callable[[Result], dict[str, Met]]) -> dict[str, Met]:
+        found: dict[str, Met] = {}
+        for result in results:
+            for name, met in of(result).items():
+                all_of_them = found.setdefault(name, Met())
+                all_of_them.latencies_ns.extend(met.latencies_ns)
+                all_of_them.sent += met.sent
+        return found
+
+    silences: dict[str, float] = {}
+    for result in results:
+        for name, silence in result.silence_ms.items():
+            silences[name] = max(silence, silences.get(name, 0.0))
+    return Result(
+        first.groups, first.robots, sum(result.seconds for result in results),
+        sum(result.frames_s for result in results) / len(results),
+        sum(result.busy for result in results) / len(results), counts,
+        together(lambda result: result.messages), together(lambda result: result.chains), silences,
+    )  # fmt: skip
 
 
 def beacon_bytes(described: Description, standard: Phy) -> int:

@@ -182,6 +182,7 @@ def _latencies(described: Description, curve: Curve, chain: Chain, terms: Terms)
     axes.annotate(f"{described.name} as described", (robots[0], rows[0]["median_ms"]), xytext=(8, -10),
                   textcoords="offset points", color=RED)  # fmt: skip
     axes.set(title=f"{title(curve.setting)}: {chain.name}", xlabel="robots", ylabel="ms", yscale="log", xticks=robots)
+    axes.set_ylim(bottom=0.6 * rows[0]["median_ms"])
     axes.legend(loc="upper left")
     return figures.svg(figure)
 

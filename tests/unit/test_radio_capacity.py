@@ -1,8 +1,8 @@
 """What a fleet sends, by its description, and how many robots a cell carries by simulation and by computation.
 
-Seen to fail by planted mistakes: frames without LLC and MAC headers, reports or beacons left out (air by hand), triggers
-that nothing follows, lost steps that do not count, a standby that triggers too, no update, every size carried, DDS
-without its headers, and a seed that is not used.
+Seen to fail by planted mistakes: frames without LLC and MAC headers, reports or beacons left out (air by hand),
+triggers that nothing follows, lost steps that do not count, a standby that triggers too, no update, every size carried,
+DDS without its headers, and a seed that is not used.
 """
 
 from __future__ import annotations
@@ -152,6 +152,17 @@ def test_the_search_ends_where_deadlines_do(four: traffic.Description) -> None:
     assert told == [point.simulated.robots for point in curve.points] == [4, 8, 12]
     for limit_ms, percent in ((1000.0, 1.0), (None, 50.0)):
         assert capacity.measure(four, B, 2, seconds=2, limit_ms=limit_ms, percent=percent).carried
+
+
+def test_runs_of_one_size_are_judged_together(four: traffic.Description) -> None:
+    runs = [load.run(four, dataclasses.replace(B, seed=seed), 1, 0.5) for seed in (1, 2)]
+    both = load.merged(runs)
+    assert both.seconds == 1
+    assert both.chains[CHAIN].sent == 100
+    assert both.chains[CHAIN].latencies_ns == [each for run in runs for each in run.chains[CHAIN].latencies_ns]
+    assert both.counts.frames == sum(run.counts.frames for run in runs)
+    assert both.busy == pytest.approx((runs[0].busy + runs[1].busy) / 2)
+    assert both.silence_ms["state"] == max(run.silence_ms["state"] for run in runs)
 
 
 def test_a_run_repeats_and_the_seed_counts(four: traffic.Description) -> None:
