@@ -47,7 +47,7 @@ size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size $(call need,ROBOT)
 
 ##@ Fleet
-.PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down provision update releases station-join station-leave
+.PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave
 fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
 	$(Q)$(FLOTILLA) fleet up $(call need,N)
 
@@ -65,6 +65,11 @@ wheeled-down: | setup-tests ## end them
 
 fleet-scale: | setup-tests ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
 	$(Q)$(FLOTILLA) fleet-scale $(call need,N) $(call option,--board,BOARD)
+
+radio-capacity: | setup ## how many robots one radio cell carries, simulated [INVENTORY=dir STANDARD=b|b-short|g|g-mixed RATE=11M AREA=10 PHASES=random UPDATE=1 LIMIT=10 MISSED=1 COMPUTE=400 SEED=1]
+	$(Q)$(FLOTILLA) radio-capacity $(call option,--inventory,INVENTORY) $(call option,--standard,STANDARD) $(call option,--rate,RATE) \
+	    $(call option,--area,AREA) $(call option,--phases,PHASES) $(if $(filter-out 0,$(UPDATE)),--update) $(call option,--limit,LIMIT) \
+	    $(call option,--missed,MISSED) $(call option,--compute,COMPUTE) $(call option,--seconds,SECONDS) $(call option,--seed,SEED)
 
 update: | setup ## robots take the bundle of their board: make update [ROBOT=3] [ON=guests] [ARGS="-e stop_tasks=true"]
 	$(Q)$(MAKE) provision PLAYBOOK=update
