@@ -322,6 +322,23 @@ def _top_arguments(parser: argparse.ArgumentParser) -> None:
     command.top_arguments(parser)
 
 
+def _convert(arguments: argparse.Namespace) -> None:
+    from flotilla.station import convert
+
+    print("\n".join(convert.convert(arguments.files, arguments.out)))
+
+
+def _convert_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("out", type=Path, help="NAME.mcap, NAME.csv or NAME.mat; it must not be there")
+    _recorder_files(parser)
+
+
+def _recorder_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE", help="of a recorder, NAME-000001.rec, or folders of such"
+    )
+
+
 def _report(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths
     from flotilla.station import report
@@ -384,6 +401,7 @@ COMMANDS = (
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Robots", "convert", "make MCAP, CSV or MAT of files of a recorder", _convert, _convert_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),

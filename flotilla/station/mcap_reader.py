@@ -19,19 +19,7 @@ from mcap.records import Schema
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.station.schema import ENCODING
-
-Array = np.ndarray[Any, np.dtype[Any]]
-
-
-@dataclass(frozen=True)
-class Topic:
-    """Messages of a topic, in the order in which they were recorded."""
-
-    name: str
-    times_ns: Array
-    """When each was received, nanoseconds since 1970-01-01 UTC."""
-    signals: dict[str, Array]
-    """Numbers by name, in the order of the schema: a row a message, of several elements where it has them."""
+from flotilla.station.topic import Topic
 
 
 @dataclass

@@ -19,7 +19,8 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.station import figures, mcap_reader
 from flotilla.station.figures import BLUE, GREY
-from flotilla.station.mcap_reader import Array, Topic
+from flotilla.station.recording import Array
+from flotilla.station.topic import Topic
 
 _PATHS = ("estimated", "pose")
 """Signals whose first two elements are where the robot is, in m."""
