@@ -237,8 +237,8 @@ top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS
 convert: | setup ## MCAP, CSV or MAT of files of a recorder: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat
 	$(Q)$(FLOTILLA) convert $(call need,OUT) $(call need_each,FILE)
 
-report: | setup ## a page of a recording: paths, commands, hops, latency: make report FILE=run.mcap [OUT=page.html]
-	$(Q)$(FLOTILLA) report $(call need,FILE) $(call option,--out,OUT)
+report: | setup ## a page of recordings: paths, commands, hops, latency: make report FILE=run.mcap|"log-*.rec" [OUT=page.html]
+	$(Q)$(FLOTILLA) report $(call option,--out,OUT) $(call need_each,FILE)
 
 param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
 	$(Q)$(FLOTILLA) param $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))

@@ -343,12 +343,18 @@ def _report(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths
     from flotilla.station import report
 
-    page = arguments.out or paths.BUILD / "reports" / f"{arguments.file.stem}.html"
-    print(f"{paths.shown(report.write(arguments.file, page))}: a page of {paths.shown(arguments.file)}")
+    page = report.write(arguments.files, arguments.out or report.page_of(arguments.files))
+    print(f"{paths.shown(page)}: a page of {', '.join(paths.shown(file) for file in arguments.files)}")
 
 
 def _report_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, help="a recording of `make record`")
+    parser.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="a recording of `make record`, or files of a recorder, *.rec",
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (build/reports/NAME.html)")
 
 

@@ -14,6 +14,8 @@ from flotilla.station.telemetry import Stream
 
 ENCODING = "protobuf"
 """Of messages and schemas, as MCAP and Foxglove call it."""
+UNITS = "units"
+"""Of a channel's metadata in MCAP: units of a signal's elements, as JSON; one alone is that of all."""
 _TYPES = {
     "boolean": "BOOL", "single": "FLOAT", "double": "DOUBLE", "int64": "INT64", "uint64": "UINT64",
     **dict.fromkeys(("int8", "int16", "int32"), "INT32"), **dict.fromkeys(("uint8", "uint16", "uint32"), "UINT32"),
