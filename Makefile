@@ -189,7 +189,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param scope record live top convert report
+.PHONY: runtime check-runtime fuzz bench-runtime param scope record live top fetch convert report
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -233,6 +233,9 @@ live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.
 
 top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
 	$(Q)$(FLOTILLA) top $(station) $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
+
+fetch: | setup ## recorder files of a robot's task: make fetch ROBOT=3 TASK=heading [OUT=directory]
+	$(Q)$(FLOTILLA) fetch $(call need,ROBOT) $(call need,TASK) $(call option,--out,OUT)
 
 convert: | setup ## MCAP, CSV or MAT of files of a recorder: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat
 	$(Q)$(FLOTILLA) convert $(call need,OUT) $(call need_each,FILE)

@@ -322,6 +322,19 @@ def _top_arguments(parser: argparse.ArgumentParser) -> None:
     command.top_arguments(parser)
 
 
+def _fetch(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from flotilla.robot import fetch
+
+    print(fetch.fetch(inventory.robot(inventory.load_fleet(), arguments.robot), arguments.task, arguments.out))
+
+
+def _fetch_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("task", help="or app, whose block recorder wrote them")
+    parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where to (build/recordings/ROBOT/TASK)")
+
+
 def _convert(arguments: argparse.Namespace) -> None:
     from flotilla.station import convert
 
@@ -407,6 +420,7 @@ COMMANDS = (
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Robots", "fetch", "bring a robot's recorder files to this computer", _fetch, _fetch_arguments),
     Command("Robots", "convert", "make MCAP, CSV or MAT of files of a recorder", _convert, _convert_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
