@@ -6,6 +6,8 @@ import csv
 import json
 import re
 import shutil
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +20,7 @@ import pytest
 from flotilla.common.errors import UserError
 from flotilla.station import convert, recording, segments
 from tests.recorder_files import MS_NS, SIGNALS, content, ring
+from tests.running import PATIENCE
 from tests.station import decoded, pymcap
 
 BEGIN_NS = 1_767_225_605_000_000_000
@@ -223,6 +226,24 @@ def test_a_full_disk_leaves_no_half(tmp_path: Path, form: str) -> None:
     with pytest.raises(UserError, match=rf"run\.{form}: No space left on device; make room"):
         convert.convert(made, tmp_path / f"run.{form}")
     assert list(tmp_path.iterdir()) == [tmp_path / "files"]
+
+
+def test_the_command_line_says_what_came_of_it(tmp_path: Path) -> None:
+    first, *_ = ring(tmp_path)
+    for words, status, said in (
+        (("convert", "run.mat", "log-*.rec"), 0, "/log: 300 records of 3 files from 2026-01-01T00:00:05 UTC on"),
+        (
+            ("report", "--out", "log.html", "log-000001.rec", "log-000002.rec"),
+            0,
+            "log.html: a page of log-000001.rec, ",
+        ),
+        (("convert", "run.mat", "log-*.rec"), 1, "error: run.mat is there already; give another name: OUT="),
+    ):
+        argv = [sys.executable, "-m", "flotilla", *words]
+        done = subprocess.run(argv, cwd=first.parent, capture_output=True, text=True, check=False, timeout=PATIENCE)
+        assert done.returncode == status, done.stderr
+        assert said in done.stdout + done.stderr
+    assert {file.name for file in tmp_path.iterdir()} >= {"run.mat", "log.html"}
 
 
 def test_more_than_a_mat_file_holds_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
