@@ -215,10 +215,10 @@ def _distances(
 
 def _histogram(topic: Topic, found: Sequence[hops.Hop]) -> str:
     figure, axes = figures.new()
-    for hop in found:
+    for hop, color in zip(found, COLOURS * len(found), strict=False):
         whole = hop is found[-1]
         counts, edges = figures.latency_bins(hop.histogram_us)
-        axes.stairs(counts, edges, label=hop.name, color="black" if whole else None, linewidth=1.4 if whole else 1)
+        axes.stairs(counts, edges, label=hop.name, color="black" if whole else color, linewidth=1.4 if whole else 1)
     figures.latency_axes(axes, f"{topic.name}: latency", None)
     return figures.svg(figure)
 

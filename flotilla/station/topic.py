@@ -37,15 +37,10 @@ class Topic:
     def came(self) -> Array:
         """Which rows hold a message: a receiver is recorded before the first one, too, and its counter is 0 then."""
         every = np.ones(len(self.times_ns), bool)
-        if self.counter is not None and self.counter.any():
-            every[: np.flatnonzero(self.counter)[0] - (self.counter[0] == 0 and self._begins_at_0)] = False
+        first = np.flatnonzero(self.counter)[:1] if self.counter is not None else []
+        for zeros in first:
+            every[:zeros] = zeros == 1  # a single one is the sender's first message
         return every
-
-    @property
-    def _begins_at_0(self) -> bool:
-        """The message before number 1 is number 0."""
-        assert self.counter is not None
-        return bool(self.counter[np.flatnonzero(self.counter)[0]] == 1)
 
     @cached_property
     def first_seen(self) -> Array:
