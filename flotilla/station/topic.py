@@ -37,8 +37,8 @@ class Topic:
     def came(self) -> Array:
         """Which rows hold a message: a receiver is recorded before the first one, too, and its counter is 0 then."""
         every = np.ones(len(self.times_ns), bool)
-        first = np.flatnonzero(self.counter)[:1] if self.counter is not None else []
-        for zeros in first:
+        if self.counter is not None and self.counter.any():
+            zeros = int(np.flatnonzero(self.counter)[0])
             every[:zeros] = zeros == 1  # a single one is the sender's first message
         return every
 

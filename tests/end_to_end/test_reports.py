@@ -81,7 +81,7 @@ def test_flights(browser: Browser, fleet: Fleet, artefacts: Path) -> None:
     assert "distance from commanded" in text
 
 
-def test_recorded_drive(browser: Browser, files: list[Path], artefacts: Path) -> None:
+def test_a_recorded_drive(browser: Browser, files: list[Path], artefacts: Path) -> None:
     text = looked_at(browser, station_report.write(files, artefacts / "recorded-drive.html"))
     assert "speeds, commanded and driven" in text
     assert "limited" in text
