@@ -51,7 +51,6 @@ def files(command: list[str | Path], tmp_path_factory: pytest.TempPathFactory) -
 
 
 def test_a_drive_that_was_recorded_is_drawn_with_its_speeds_and_states(files: list[Path], tmp_path: Path) -> None:
-    """Seen to fail with `wanted` taken for a place."""
     assert len(files) > 2
     ((topic,), notes) = report.read(files[::-1])
     assert notes == []

@@ -56,7 +56,7 @@ def topics(files: list[Path]) -> dict[str, Topic]:
 
 
 def test_a_flight_shows_paths_valves_latency_and_error(flight: list[Path], tmp_path: Path) -> None:
-    """Seen to fail without the rows before the first message left out: the error is a metre, and 19 steps are lost."""
+    """Rows before the first message are no places: the error would be a metre."""
     text = report.write(flight, tmp_path / "flight.html").read_text()
     for title in (
         "path", "distance from commanded", "/steps: latency", "/steps: latency of all hops", "/steps: valves",
@@ -76,7 +76,6 @@ def test_a_flight_shows_paths_valves_latency_and_error(flight: list[Path], tmp_p
 
 
 def test_a_message_that_was_recorded_twice_counts_once(flight: list[Path]) -> None:
-    """Seen to fail with all rows: 380."""
     steps = topics(flight)["/steps"]
     assert list(np.flatnonzero(~steps.came)) == list(range(20))
     (found, *_) = hops.hops(steps)
@@ -97,7 +96,7 @@ def _drive(commanded: str) -> Topic:
 
 
 def test_speeds_that_are_commanded_are_no_places() -> None:
-    """Seen to fail with `wanted` a place wherever it is: the map shows a robot that should be at 0.4 m."""
+    """With `wanted` a place, the map would show a robot that should be at 0.4 m."""
     drawn = [*pictures.of_robots([_drive("wanted")], 0), *pictures.of_topic(_drive("wanted"), 0)]
     titles = [re.search(r"<!-- ([^\n]*(?:path|speeds|distance|flags|pose|free)[^\n]*) -->", each) for each in drawn]
     text = "".join(drawn)
@@ -121,7 +120,7 @@ def test_states_last_until_the_next_message() -> None:
 
 
 def test_long_recordings_make_no_long_page(tmp_path: Path) -> None:
-    """An hour at 100 Hz with one peak, one flash, and a pause. Seen to fail with every point drawn: 40 MB."""
+    """An hour at 100 Hz with one peak, one flash, and a pause."""
     count = 360_000
     seconds = np.arange(count) / 100
     seconds[count // 2 :] += 1000
