@@ -209,7 +209,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive report
+.PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive fetch convert report
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -261,8 +261,14 @@ top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS
 drive: | setup ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN] [INVENTORY=]
 	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT) $(call option,--inventory,INVENTORY)
 
-report: | setup ## a page of a recording: paths, commands, hops, latency: make report FILE=run.mcap [OUT=page.html]
-	$(Q)$(FLOTILLA) report $(call need,FILE) $(call option,--out,OUT)
+fetch: | setup ## recorder files of a robot's task: make fetch ROBOT=3 TASK=heading [OUT=directory]
+	$(Q)$(FLOTILLA) fetch $(call need,ROBOT) $(call need,TASK) $(call option,--out,OUT)
+
+convert: | setup ## MCAP, CSV or MAT of files of a recorder: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat
+	$(Q)$(FLOTILLA) convert $(call need,OUT) $(call need_each,FILE)
+
+report: | setup ## a page of recordings: paths, commands, hops, latency: make report FILE=run.mcap|"log-*.rec" [OUT=page.html]
+	$(Q)$(FLOTILLA) report $(call option,--out,OUT) $(call need_each,FILE)
 
 param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
 	$(Q)$(FLOTILLA) param $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
@@ -341,4 +347,5 @@ given = $(call quoted,$(value $1))
 each_given = $(foreach each,$(value $1),$(call quoted,$(each)))
 option = $(if $(value $2),$1 $(call given,$2))
 need = $(if $(value $1),$(call given,$1),$(error say which: make $@ $1=…))
+need_each = $(if $(call need,$1),$(call each_given,$1))
 shell_scripts = git grep -l -E '^\#!/bin/(ba)?sh' -- flotilla images lab rootfs_overlay tests .ci

@@ -390,16 +390,52 @@ def _page_arguments(parser: argparse.ArgumentParser) -> None:
     page_command.page_arguments(parser)
 
 
+def _fetch(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from flotilla.robot import fetch
+
+    print(fetch.fetch(inventory.robot(inventory.load_fleet(), arguments.robot), arguments.task, arguments.out))
+
+
+def _fetch_arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument("task", help="or app, whose block recorder wrote them")
+    parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where to (build/recordings/ROBOT/TASK)")
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    from flotilla.station import convert
+
+    print("\n".join(convert.convert(arguments.files, arguments.out)))
+
+
+def _convert_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("out", type=Path, help="NAME.mcap, NAME.csv or NAME.mat; it must not be there")
+    _recorder_files(parser)
+
+
+def _recorder_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE", help="of a recorder, NAME-000001.rec, or folders of such"
+    )
+
+
 def _report(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths
     from flotilla.station import report
 
-    page = arguments.out or paths.BUILD / "reports" / f"{arguments.file.stem}.html"
-    print(f"{paths.shown(report.write(arguments.file, page))}: a page of {paths.shown(arguments.file)}")
+    page = report.write(arguments.files, arguments.out or report.page_of(arguments.files))
+    print(f"{paths.shown(page)}: a page of {', '.join(paths.shown(file) for file in arguments.files)}")
 
 
 def _report_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, help="a recording of `make record`")
+    parser.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="a recording of `make record`, or files of a recorder, *.rec",
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (build/reports/NAME.html)")
 
 
@@ -458,6 +494,8 @@ COMMANDS = (
     Command("Robots", "station-leave", "take it out, and put everything back", _station_leave,
             _station_leave_arguments),
     Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments),
+    Command("Robots", "fetch", "bring a robot's recorder files to this computer", _fetch, _fetch_arguments),
+    Command("Robots", "convert", "make MCAP, CSV or MAT of files of a recorder", _convert, _convert_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
     Command("Apps", "import-model", "make an app of what MATLAB's packNGo packed, or renew its code", _import_model,

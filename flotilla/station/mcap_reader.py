@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -14,29 +15,18 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import NonSeekingReader
-from mcap.records import Schema
+from mcap.records import Channel, Schema
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.station.schema import ENCODING
-
-Array = np.ndarray[Any, np.dtype[Any]]
-
-
-@dataclass(frozen=True)
-class Topic:
-    """Messages of a topic, in the order in which they were recorded."""
-
-    name: str
-    times_ns: Array
-    """When each was received, nanoseconds since 1970-01-01 UTC."""
-    signals: dict[str, Array]
-    """Numbers by name, in the order of the schema: a row a message, of several elements where it has them."""
+from flotilla.station.schema import ENCODING, UNITS
+from flotilla.station.topic import Topic
 
 
 @dataclass
 class _Rows:
     names: list[str]
+    units: dict[str, tuple[str, ...]]
     times_ns: list[int] = field(default_factory=list)
     values: list[list[Any]] = field(default_factory=list)
 
@@ -63,12 +53,12 @@ def read(file: Path) -> list[Topic]:
 def _read(opened: IO[bytes]) -> list[Topic]:
     kinds: dict[int, type[Any]] = {}
     topics: dict[str, _Rows] = {}
-    for schema, topic, data, time_ns in messages(opened):
+    for schema, channel, data, time_ns in messages(opened):
         if schema.id not in kinds:
             kinds[schema.id] = message_class(schema)
         message = kinds[schema.id].FromString(data)
         names = [each.name for each in message.DESCRIPTOR.fields if _is_number(each)]
-        rows = topics.setdefault(topic, _Rows(names))
+        rows = topics.setdefault(channel.topic, _Rows(names, _units(channel)))
         rows.times_ns.append(time_ns)
         rows.values.append([getattr(message, name) for name in rows.names])
     return [
@@ -76,16 +66,25 @@ def _read(opened: IO[bytes]) -> list[Topic]:
             name,
             np.array(rows.times_ns),
             {signal: np.array([row[at] for row in rows.values]) for at, signal in enumerate(rows.names)},
+            rows.units,
         )
         for name, rows in sorted(topics.items())
     ]
 
 
-def messages(opened: IO[bytes]) -> Iterator[tuple[Schema, str, bytes, int]]:
+def messages(opened: IO[bytes]) -> Iterator[tuple[Schema, Channel, bytes, int]]:
     with suppress(EndOfFile):  # whoever recorded it was killed, or records still
         for schema, channel, message in NonSeekingReader(opened).iter_messages(log_time_order=False):
             if schema and schema.encoding == channel.message_encoding == ENCODING:
-                yield schema, channel.topic, message.data, message.log_time
+                yield schema, channel, message.data, message.log_time
+
+
+def _units(channel: Channel) -> dict[str, tuple[str, ...]]:
+    """As `make record` writes them; nothing where another program recorded."""
+    try:
+        return {name: tuple(map(str, each)) for name, each in json.loads(channel.metadata.get(UNITS, "{}")).items()}
+    except (ValueError, AttributeError, TypeError):
+        return {}
 
 
 def message_class(schema: Schema) -> type[Any]:

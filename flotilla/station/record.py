@@ -7,6 +7,7 @@ the program is killed or the disk is full.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +19,7 @@ from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet.drawings import Drawing
 from flotilla.station.recording import Value
-from flotilla.station.schema import ENCODING, Schema, topics
+from flotilla.station.schema import ENCODING, UNITS, Schema, topics
 from flotilla.station.telemetry import Stream
 
 
@@ -46,7 +47,8 @@ class Recorder:
                 channels = self._channels[stream.topic] = {}
                 for topic, schema in topics(stream).items():
                     number = self._writer.register_schema(schema.name, ENCODING, schema.data)
-                    channels[topic] = (self._writer.register_channel(topic, ENCODING, number), schema)
+                    metadata = {UNITS: json.dumps(stream.units)} if topic == stream.topic else {}
+                    channels[topic] = (self._writer.register_channel(topic, ENCODING, number, metadata), schema)
 
     def take(self, stream: Stream, values: Mapping[str, Value], received_ns: int) -> None:
         for topic, (channel, schema) in self._channels[stream.topic].items():

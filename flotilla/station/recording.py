@@ -1,24 +1,29 @@
-"""Read what the block `recorder` wrote; its C file tells the format. As a program, print it as CSV:
-
-python3 -m flotilla.station.recording log-000001.rec log-000002.rec >log.csv
-"""
+"""Read what the block `recorder` wrote, a file at a time; its C file tells the format. `segments.py` joins files."""
 
 from __future__ import annotations
 
-import csv
 import json
 import struct
-import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
+import numpy as np
+
+from flotilla.common import paths
 from flotilla.common.signals import CODES, size
 
 MAGIC = b"FLOTREC1"
 PREFIX = struct.Struct("<8sII")
 CHECK = struct.Struct("<I")
+MOST_HEADER_BYTES = 1 << 24
+CHUNK_BYTES = 1 << 20
+"""Of a file in memory at once, about."""
+_OUTERMOST = 1000
+"""Records of which one has to be good, for a file not to be wholly damaged."""
+Array = np.ndarray[Any, np.dtype[Any]]
 Element = bool | int | float
 Value = Element | tuple[Element, ...]
 
@@ -51,7 +56,50 @@ class Field:
 
 
 @dataclass(frozen=True)
+class Header:
+    """What a file says of itself before its records."""
+
+    name: str
+    period_ns: int
+    wall_less_monotonic_ns: int
+    """Add it to `time_ns` for nanoseconds since 1970-01-01 UTC."""
+    fields: tuple[Field, ...]
+    bytes_of_header: int
+    bytes_of_record: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of a record: a field of several elements is an array."""
+        kinds = [dtype(field.type) for field in self.fields]
+        return np.dtype(
+            {
+                "names": [field.name for field in self.fields],
+                "formats": [
+                    (kind, (field.width,)) if field.width > 1 else kind
+                    for kind, field in zip(kinds, self.fields, strict=True)
+                ],
+                "offsets": [field.offset for field in self.fields],
+                "itemsize": self.bytes_of_record,
+            }
+        )
+
+
+@dataclass
+class Found:
+    """What was in a file besides good records; it grows while records are read."""
+
+    records: int = 0
+    """Those whose check is good."""
+    damaged: int = 0
+    """Whole records whose check is wrong."""
+    rest: int = 0
+    """Bytes of half a record at the end: power went, or it is being written now."""
+
+
+@dataclass(frozen=True)
 class Recording:
+    """A whole file in memory."""
+
     name: str
     period_ns: int
     wall_less_monotonic_ns: int
@@ -60,9 +108,13 @@ class Recording:
     records: list[dict[str, Value]]
     """Those whose check is good, in the order in which they were written."""
     damaged: int
-    """Whole records whose check is wrong."""
     rest: int
-    """Bytes of half a record at the end: power went, or it is being written now."""
+    """This and `damaged`: as `Found` has them."""
+
+
+def dtype(kind: str) -> np.dtype[Any]:
+    """Of an element of a signal, little-endian."""
+    return np.dtype(CODES[kind]).newbyteorder("<")
 
 
 def _check_field(field: Field, bytes_of_record: int) -> None:
@@ -72,63 +124,95 @@ def _check_field(field: Field, bytes_of_record: int) -> None:
         raise ValueError(f"field {field.name} reaches beyond its record")
 
 
-def parse(data: bytes) -> Recording:
+def parse_header(data: bytes) -> Header:
+    """Of a file that begins so. RecordingError where it is no recording, or ends within its header."""
     try:
         magic, bytes_of_header, bytes_of_record = PREFIX.unpack_from(data)
         if magic != MAGIC or bytes_of_header < PREFIX.size or bytes_of_record <= CHECK.size:
             raise ValueError("it does not begin as one")
+        if bytes_of_header > min(len(data), MOST_HEADER_BYTES):
+            raise ValueError("it ends within its header")
         schema = json.loads(data[PREFIX.size : bytes_of_header])
-        fields = [Field(**field) for field in schema["fields"]]
+        fields = tuple(Field(**field) for field in schema["fields"])
         for field in fields:
             _check_field(field, bytes_of_record)
-        name, period, wall = schema["name"], schema["period_ns"], schema["wall_less_monotonic_ns"]
+        if not {"time_ns", "step"} <= {field.name for field in fields} or len({f.name for f in fields}) < len(fields):
+            raise ValueError("it lacks time_ns or step, or has a field twice")
+        name, period_ns, wall_ns = str(schema["name"]), int(schema["period_ns"]), int(schema["wall_less_monotonic_ns"])
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"no recording: {error}") from error
-    whole, rest = divmod(len(data) - bytes_of_header, bytes_of_record)
+    return Header(name, period_ns, wall_ns, fields, bytes_of_header, bytes_of_record)
+
+
+def read_header(file: Path) -> Header:
+    """RecordingError as above."""
+    with file.open("rb") as opened:
+        return _header(opened)
+
+
+def _header(opened: IO[bytes]) -> Header:
+    begin = opened.read(PREFIX.size)
+    length = PREFIX.unpack(begin)[1] if len(begin) == PREFIX.size else 0
+    return parse_header(begin + opened.read(min(max(length - len(begin), 0), MOST_HEADER_BYTES)))
+
+
+def chunks(file: Path, found: Found) -> Iterator[Array]:
+    """Its good records, in order, some at a time; `found` counts them, and what is left out."""
+    with file.open("rb") as opened:
+        header = _header(opened)
+        length, kind = header.bytes_of_record, header.dtype
+        while data := opened.read(max(CHUNK_BYTES // length, 1) * length):
+            whole, found.rest = divmod(len(data), length)
+            good = [_is_good(data[at * length : (at + 1) * length]) for at in range(whole)]
+            found.records += sum(good)
+            found.damaged += whole - sum(good)
+            records = np.frombuffer(data, kind, whole)
+            yield records if all(good) else records[np.array(good, bool)]
+
+
+def ends(file: Path) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
+    """`time_ns` and `step` of the first and of the last good record; None where none of the outermost ones is good."""
+    with file.open("rb") as opened:
+        header = _header(opened)
+        length = header.bytes_of_record
+        whole = (file.stat().st_size - header.bytes_of_header) // length
+        near = range(min(whole, _OUTERMOST))
+
+        def first_of(numbers: Iterable[int]) -> tuple[int, int] | None:
+            for number in numbers:
+                opened.seek(header.bytes_of_header + number * length)
+                record = opened.read(length)
+                if _is_good(record):
+                    values = np.frombuffer(record, header.dtype)[0]
+                    return int(values["time_ns"]), int(values["step"])
+            return None
+
+        return first_of(near), first_of(whole - 1 - number for number in near)
+
+
+def _is_good(record: bytes) -> bool:
+    return CHECK.unpack(record[-CHECK.size :]) == (zlib.crc32(record[: -CHECK.size]),)
+
+
+def parse(data: bytes) -> Recording:
+    """A whole file's content. RecordingError as above."""
+    header = parse_header(data)
+    length = header.bytes_of_record
+    whole, rest = divmod(len(data) - header.bytes_of_header, length)
     records = []
-    for begin in range(bytes_of_header, bytes_of_header + whole * bytes_of_record, bytes_of_record):
-        record = data[begin : begin + bytes_of_record]
-        if CHECK.unpack(record[-CHECK.size :]) == (zlib.crc32(record[: -CHECK.size]),):
-            records.append({field.name: field.of(record) for field in fields})
-    return Recording(name, period, wall, fields, records, whole - len(records), rest)
+    for begin in range(header.bytes_of_header, header.bytes_of_header + whole * length, length):
+        record = data[begin : begin + length]
+        if _is_good(record):
+            records.append({field.name: field.of(record) for field in header.fields})
+    return Recording(
+        header.name, header.period_ns, header.wall_less_monotonic_ns, list(header.fields), records,
+        whole - len(records), rest,
+    )  # fmt: skip
 
 
 def read(path: Path) -> Recording:
+    """A whole file. RecordingError that names it."""
     try:
         return parse(path.read_bytes())
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
-
-
-def _rows(recording: Recording) -> Iterator[list[Element]]:
-    for record in recording.records:
-        row: list[Element] = []
-        for value in record.values():
-            row.extend(value if isinstance(value, tuple) else (value,))
-        yield row
-
-
-def main(paths: list[str]) -> int:
-    writer = csv.writer(sys.stdout)
-    titles: list[str] | None = None
-    for path in paths:
-        try:
-            recording = read(Path(path))
-        except (OSError, RecordingError) as error:
-            print(error, file=sys.stderr)
-            return 1
-        columns = [title for field in recording.fields for title in field.titles]
-        if titles is None:
-            writer.writerow(columns)
-        elif columns != titles:
-            print(f"{path}: other signals than in {paths[0]}", file=sys.stderr)
-            return 1
-        titles = columns
-        writer.writerows(_rows(recording))
-        if recording.damaged:
-            print(f"{path}: {recording.damaged} damaged records left out", file=sys.stderr)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+        raise RecordingError(f"{paths.shown(path)}: {error}") from error

@@ -127,10 +127,10 @@ def _load(file: Path) -> tuple[list[_Message], dict[str, Any]]:
                 "the most that is replayed; record in parts, or open it in Foxglove"
             )
         with file.open("rb") as opened:
-            for described, topic, data, time_ns in mcap_reader.messages(opened):
-                if topic not in kinds:
-                    kinds[topic] = mcap_reader.message_class(described)
-                messages.append(_Message(time_ns, topic, data))
+            for described, channel, data, time_ns in mcap_reader.messages(opened):
+                if channel.topic not in kinds:
+                    kinds[channel.topic] = mcap_reader.message_class(described)
+                messages.append(_Message(time_ns, channel.topic, data))
     except OSError as error:
         raise UserError(f"{paths.shown(file)}: {error.strerror}; record one: make record OUT=FILE") from error
     except (McapError, KeyError, TypeError, ValueError) as error:
@@ -159,12 +159,12 @@ def _stream(topic: str, kind: Any, messages: list[_Message]) -> Stream | None:
 def _fits(stream: Stream, kind: Any) -> bool:
     """Whether the recording has all signals of a stream: the inventory may have changed since."""
     members = {each.name for each in kind.DESCRIPTOR.fields}
-    return all(schema.identifier(each.name) in members for each in stream.fields)
+    return members.issuperset(schema.identifiers(each.name for each in stream.fields).values())
 
 
 def _values(stream: Stream, message: Any) -> Mapping[str, Value]:
     found: dict[str, Value] = {}
-    for each in stream.fields:
-        value = getattr(message, schema.identifier(each.name))
-        found[each.name] = value if isinstance(value, bool | int | float) else tuple(value)
+    for name, member in schema.identifiers(each.name for each in stream.fields).items():
+        value = getattr(message, member)
+        found[name] = value if isinstance(value, bool | int | float) else tuple(value)
     return found

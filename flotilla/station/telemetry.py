@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flotilla.fleet.drawings import Drawing
@@ -29,6 +29,8 @@ class Stream:
     """Steps of the task from one datagram to the next."""
     charge: str | None = None
     """The field that is a battery's state of charge, 0 to 1."""
+    units: Mapping[str, Sequence[str]] = field(default_factory=dict, compare=False)
+    """Of each signal's elements, or one for all, where messages.yml says them."""
     drawings: Mapping[str, Drawing] = field(default_factory=dict, compare=False)
     """What viewers draw of it, by name; `pose` has the topic `/robot1/valves/report/pose`."""
 
@@ -65,6 +67,7 @@ def streams(fleet: Fleet) -> list[Stream]:
             step_s=message.step_s,
             every=message.every,
             charge=message.charge,
+            units={name.replace("-", "_"): signal.unit for name, signal in message.signals.items() if signal.unit},
             drawings={name: Drawing(drawn, message.signals) for name, drawn in message.foxglove.items()},
         )
         for robot in fleet.robots.values()

@@ -95,6 +95,17 @@ ELSEWHERE = {
         ),
         "needs the robot; test_control_loop.py asks a guest",
     ),
+    "make fetch ROBOT=3 TASK=heading": "needs the robot; unit/test_fetch.py",
+    **dict.fromkeys(
+        (
+            "make report FILE=run.mcap",
+            "make report FILE=build/recordings/robot3/heading",
+            'make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap',
+            "make convert FILE=build/recordings/robot3/heading OUT=run.mat",
+            'make convert FILE="build/recordings/robot3/heading/log-*.rec" OUT=run.csv',
+        ),
+        "needs recordings; unit/test_convert.py and unit/test_report_of_files.py make the like",
+    ),
     "make deploy ROBOT=3 APP=apps/hover": "runs until Ctrl-C; test_deploy.py",
     "make deploy ROBOT=3 APP=apps/hover RUN=status": "needs the robot; test_deploy.py asks a guest",
     "make deploy ROBOT=3 APP=apps/hover ON_ROBOT=1": "needs the robot; test_deploy.py compiles on a guest",

@@ -12,12 +12,17 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet
+from flotilla.station import report as station_report
 from lab.latency import gate, report, results
 from lab.scenarios import report as flights_report
 from lab.scenarios import virtual
 from lab.scenarios.flight import Flight
 from lab.scenarios.plans import TESTED_SIDE_M, plans
 from tests.browser import Browser
+from tests.runtime import test_recorded_drive
+
+command = test_recorded_drive.command
+files = test_recorded_drive.files
 
 pytestmark = pytest.mark.nightly
 
@@ -70,3 +75,13 @@ def test_flights(browser: Browser, fleet: Fleet, artefacts: Path) -> None:
     flights = {plan.title: Flight.read(flown[plan.name]) for plan in chosen}
     text = looked_at(browser, flights_report.write(flights, artefacts))
     assert all(title in text for title in flights)
+    recorded = sorted(flown["udp"].glob("*/*.rec"))
+    text = looked_at(browser, station_report.write(recorded, artefacts / "recorded-flight.html"))
+    assert all(f"/{name}" in text for name in ("flown", "steps", "controls"))
+    assert "distance from commanded" in text
+
+
+def test_a_recorded_drive(browser: Browser, files: list[Path], artefacts: Path) -> None:
+    text = looked_at(browser, station_report.write(files, artefacts / "recorded-drive.html"))
+    assert "speeds, commanded and driven" in text
+    assert "limited" in text

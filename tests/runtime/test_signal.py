@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flotilla.station import recording
+from flotilla.station import convert, recording
 from tests.running import PATIENCE, Row
 
 Rows = list[Row]
@@ -153,7 +153,7 @@ def check_square(found: recording.Recording) -> None:
         assert position == pytest.approx((1e-11 * (time_ns - wall_ns), 0), abs=1e-12)
 
 
-def test_recording_is_read_back(flotilla_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recording_is_read_back(flotilla_run: Path, tmp_path: Path) -> None:
     task = tmp_path / "task.yml"
     task.write_text(RECORDED.format(directory=tmp_path))
     subprocess.run([flotilla_run, "--no-wait", "--steps", "100", task], check=True, timeout=PATIENCE)
@@ -162,11 +162,11 @@ def test_recording_is_read_back(flotilla_run: Path, tmp_path: Path, capsys: pyte
     check_square(found)
     assert len(found.records) == 100
     assert found.rest == 0
-    assert recording.main([str(path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "time_ns,step,lost,position[0],position[1],done,step_number"
-    assert lines[100].split(",")[1:3] == ["99", "0"]
-    assert math.isclose(float(lines[100].split(",")[3]), 0.00099)
+    convert.convert([path], tmp_path / "log.csv")
+    lines = (tmp_path / "log.csv").read_text().splitlines()
+    assert lines[0] == "time_s,wall_ns,time_ns,step,lost,position[0],position[1],done,step_number"
+    assert lines[100].split(",")[3:5] == ["99", "0"]
+    assert math.isclose(float(lines[100].split(",")[5]), 0.00099)
 
 
 def test_recording_of_a_killed_task_is_readable(flotilla_run: Path, tmp_path: Path) -> None:

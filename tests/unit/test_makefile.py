@@ -39,7 +39,9 @@ GIVEN = {
     "record": ["PORT", "SECONDS", "ADDRESS"],
     "live": ["OUT", "SECONDS"],
     "top": ["OUT", "PORT"],
-    "report": ["FILE", "OUT"],
+    "fetch": ["ROBOT", "TASK", "OUT"],
+    "convert": ["OUT"],
+    "report": ["OUT"],
     "param": ["ROBOT", "TASK", "PARAM", "VALUE"],
     "scope": ["ROBOT", "TASK", "EVERY", "ROWS", "TRIGGER", "BEFORE", "CSV"],
     "latency": ["BOARD", "KERNEL", "PLAN", "TARGET"],
@@ -48,8 +50,12 @@ GIVEN = {
     "hwcheck": ["ROBOT", "SECONDS"],
     "scenarios": ["ROBOTS", "SIDE"],
 }
-WORDS = {"provision": "ARGS", "scenarios": "FLIGHTS", "record": "OUT", "live": "PORT"}
+WORDS = {
+    "provision": "ARGS", "scenarios": "FLIGHTS", "record": "OUT", "live": "PORT", "report": "FILE", "convert": "FILE",
+}  # fmt: skip
 """Of which each word is one of the program."""
+NEEDED = {"report": {"FILE": "a.mcap"}, "convert": {"FILE": "a.rec b.rec", "OUT": "a.csv"}}
+"""What a target does not do without."""
 
 
 def make(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -76,7 +82,8 @@ def test_what_is_given_is_one_word(tmp_path: Path, target: str) -> None:
     """Seen to fail where variables stand in commands as they are: APP='x;id' ran id."""
     file = tmp_path / "injected"
     value = HOSTILE.format(file=file)
-    done = make(tmp_path, target, *(f"{name}={value}" for name in GIVEN[target]))
+    given = NEEDED.get(target, {}) | dict.fromkeys(GIVEN[target], value)
+    done = make(tmp_path, target, *(f"{name}={each}" for name, each in given.items()))
     assert done.returncode == 0, done.stderr
     assert not file.exists()
     words = programs_said(tmp_path)[0]
@@ -86,7 +93,8 @@ def test_what_is_given_is_one_word(tmp_path: Path, target: str) -> None:
 @pytest.mark.parametrize("target", WORDS)
 def test_what_is_given_as_words_is_no_command(tmp_path: Path, target: str) -> None:
     file = tmp_path / "injected"
-    done = make(tmp_path, target, f"{WORDS[target]}=--check x;touch {file} `touch {file}`")
+    given = NEEDED.get(target, {}) | {WORDS[target]: f"--check x;touch {file} `touch {file}`"}
+    done = make(tmp_path, target, *(f"{name}={each}" for name, each in given.items()))
     assert done.returncode == 0, done.stderr
     assert not file.exists()
     (words,) = programs_said(tmp_path)

@@ -329,7 +329,7 @@ _RECORDED = {
 def test_recordings_keep_their_schemas() -> None:
     found = {}
     for stream in telemetry.streams(virtual.fleet("udp")):
-        schema = Schema(stream)
+        schema = Schema.of(stream)
         (file,) = descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
         (message,) = file.message_type
         assert [field.number for field in message.field] == list(range(1, len(message.field) + 1))
@@ -355,4 +355,4 @@ def test_every_type_of_signal_can_be_recorded(tasks: Path) -> None:
     (stream,) = [stream for stream in telemetry.streams(virtual.fleet("udp")) if stream.name == "all"]
     assert stream.length == 3 * (1 + 1 + 1 + 2 + 2 + 4 + 4 + 8 + 8 + 4 + 8)
     assert [field.offset for field in stream.fields] == [0, 3, 6, 9, 15, 21, 33, 45, 69, 93, 105]
-    assert Schema(stream).encode(stream.unpack(bytes(stream.length)), 0)
+    assert Schema.of(stream).encode(stream.unpack(bytes(stream.length)), 0)

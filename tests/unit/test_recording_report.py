@@ -12,7 +12,7 @@ import pytest
 
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
-from flotilla.station import mcap_reader, report
+from flotilla.station import hops, mcap_reader, report
 from flotilla.station.record import Recorder
 from flotilla.station.telemetry import streams
 from tests.station import FLEET
@@ -70,7 +70,7 @@ def test_loss_is_counted_and_hops_are_measured(recording: Path) -> None:
     assert accounts["/robot1/valves/report"].longest_gap_s == pytest.approx(0.03)
     assert accounts["/robot3/control/report"].lost == 0
     assert accounts["/robot3/control/report"].rate_hz == pytest.approx(10)
-    found = {hop.name: set(hop.us) for hop in report.hops(topics["/robot1/valves/report"])}
+    found = {hop.name: set(hop.us) for hop in hops.hops(topics["/robot1/valves/report"])}
     assert found == {
         "sensed → navigation": {400},
         "navigation → control": {700},
@@ -78,20 +78,20 @@ def test_loss_is_counted_and_hops_are_measured(recording: Path) -> None:
         "mapping → valves": {1900},
         "all": {4100},
     }
-    assert report.hops(topics["/robot3/control/report"]) == []
+    assert hops.hops(topics["/robot3/control/report"]) == []
 
 
 def test_the_page_has_it_all_and_repeats_to_the_byte(recording: Path, tmp_path: Path) -> None:
-    page = report.write(recording, tmp_path / "pages" / "one.html")
+    page = report.write([recording], tmp_path / "pages" / "one.html")
     text = page.read_text()
     assert "<td>/robot1/valves/report</td><td>497</td>" in text
     assert '<td class="missed">3</td>' in text
     assert re.search(r"<td>all</td>(<td>4100</td>){4}", text)
-    titles = ("/robot3/control/report: path", "/robot1/valves/report: latency", "/robot1/valves/report valves")
+    titles = ("robot3: path", "/robot1/valves/report: latency", "/robot1/valves/report: valves")
     for title in titles:
         assert title in text, title
     assert "step</text>" not in text
-    assert report.write(recording, tmp_path / "other.html").read_text() == text
+    assert report.write([recording], tmp_path / "other.html").read_text() == text
 
 
 def test_a_recording_that_was_cut_off_is_read_as_far_as_it_goes(recording: Path, tmp_path: Path) -> None:
@@ -117,11 +117,11 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, content: bytes | None, 
     if content is not None:
         file.write_bytes(content)
     with pytest.raises(UserError, match=re.escape(reason)):
-        report.write(file, tmp_path / "page.html")
+        report.write([file], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
 def test_a_page_that_cannot_be_written_is_named(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"file/page\.html: .*; name another file: OUT="):
-        report.write(recording, tmp_path / "file" / "page.html")
+        report.write([recording], tmp_path / "file" / "page.html")

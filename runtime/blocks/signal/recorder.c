@@ -1,7 +1,7 @@
 /** recorder
  *
  * Records signals in files, as records of a fixed size. The step puts a record into a buffer; a thread of ordinary
- * priority writes it. flotilla/station/recording.py reads the files.
+ * priority writes it. make convert and make report read the files.
  *
  * A file NAME-000001.rec, all little-endian, is a header and then records until its end:
  *
