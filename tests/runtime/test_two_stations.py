@@ -67,7 +67,7 @@ def task(flotilla_run: Path, tmp_path: Path, port: int) -> Iterator[Task]:
 
 
 def test_each_station_is_heard(task: Task, port: int) -> None:
-    """Seen to fail with a failover of 0.1 s, by which the second station is not noticed."""
+    """Seen to fail with a failover of 5 s, by which the second station is not noticed."""
     first = Station(FIRST, 1, port)
     try:
         task.until(lambda row: row["flag"] and row["operator"] == 1)
@@ -86,7 +86,7 @@ def test_each_station_is_heard(task: Task, port: int) -> None:
 
 def test_a_flood_ends_in_a_stop(task: Task, port: int) -> None:
     """2000 commands at once are more than the task takes in 0.3 s. What has waited for longer moves nothing, and it
-    goes on when the queue is empty. Seen to fail with timeouts of an hour."""
+    goes on when the queue is empty. Seen to fail with `take: newest`."""
     first = Station(FIRST, 1, port)
     try:
         task.until(lambda row: row["flag"])
