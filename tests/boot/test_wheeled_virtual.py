@@ -157,8 +157,7 @@ def test_without_its_bus_it_stops(troubles: Driven) -> None:
 
 
 def test_it_stops_while_a_second_operator_commands(operators: Driven) -> None:
-    """And names both, until 1 s after the second one's last command; its boom does not move. Then it goes on. Seen to
-    fail with a guard that never says conflict."""
+    """And names both, until 1 s after the second one's last command; its boom does not move. Then it goes on."""
     rests(operators, 5, STOPS_S, 6.8)
     for report in operators.told(5.2, 6.8):
         told = {name: report[name] for name in ("alive", "conflict", "operator", "other")}

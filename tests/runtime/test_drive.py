@@ -258,8 +258,7 @@ def test_a_closed_terminal_stops_it(fleet: Path, robot: Robot, tmp_path: Path) -
 
 
 def test_a_gamepad_drives_it(fleet: Path, robot: Robot, tmp_path: Path) -> None:
-    """Held button and stick move it; the button's release, and an unplugged gamepad, stop it. Seen to fail with a pad
-    that keeps its button when it is gone."""
+    """Held button and stick move it; the button's release, and an unplugged gamepad, stop it."""
     path = tmp_path / "event5"
     os.mkfifo(path)
     pad = os.open(path, os.O_RDWR)
