@@ -101,7 +101,7 @@ def test_three_rates_by_a_clock_that_counts(bench: Bench) -> None:
 
 @pytest.mark.clock
 def test_the_fastest_rate_runs_while_the_slowest_computes_for_three_of_its_periods(bench: Bench) -> None:
-    """Values are those of one thread. Seen to fail with `rates_in_turn` set, and without the threads' priorities."""
+    """Values are those of one thread. Seen to fail where each step waited for the rates."""
     run = bench.run(busy=3, priority=70, steps=23)
     judge(run)
     assert [rate["overruns"] for rate in run.rates] == [0, 0]
@@ -113,7 +113,7 @@ def test_the_fastest_rate_runs_while_the_slowest_computes_for_three_of_its_perio
 @pytest.mark.clock
 def test_an_overrun_of_a_slower_rate_is_counted_or_ends_the_task(bench: Bench, tmp_path: Path) -> None:
     """The slowest rate computes for 8 of its 6 steps. Where no priority is to be had it is awaited instead, and the
-    steps that it delays are the overruns. Seen to fail where rates did not count, and with another ending."""
+    steps that it delays are the overruns."""
     run = bench.run(busy=8, priority=70, steps=20)
     assert run.status == 0, run.said
     assert run.overruns > 0
@@ -136,7 +136,7 @@ def test_in_one_thread(bench: Bench) -> None:
 
 
 def test_a_root_port_of_two_rates_is_refused(bench: Bench) -> None:
-    """One thread may use it. Seen to fail with ports of the fastest rate only."""
+    """One thread may use it."""
     ert_rates.write(bench.generated)
     source = bench.generated / "three.c"
     text = source.read_text()

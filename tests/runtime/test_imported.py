@@ -157,7 +157,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
 def test_what_is_refused_leaves_nothing(
     archive: Path, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Path], Path], said: str
 ) -> None:
-    """Archives are not trusted. Each was seen to pass, or to fail otherwise, without its check."""
+    """Archives are not trusted. Seen to fail without the checks of paths, size and code."""
     monkeypatch.setattr(imported, "BYTES", 100_000)
     spoilt = spoil(archive)
     with pytest.raises(UserError, match=said):

@@ -74,8 +74,7 @@ def script(flotilla_run: Path, work: Path, *words: str) -> Path:
 
 
 def test_all_blocks_get_masks_with_named_parameters(flotilla_run: Path, octave: Octave) -> None:
-    """Seen to fail with a default in hexadecimal digits, which is no double in MATLAB, with a name of Simulink's own,
-    with a parameter left out of a mask, and with the library created after its blocks."""
+    """Seen to fail with a default in hexadecimal digits, which is no double in MATLAB."""
     done = octave.run(f"run('{script(flotilla_run, octave.work)}')")
     assert done.returncode == 0, done.stderr
     actions = [action for action, _ in octave.calls("legacy_code")]
@@ -94,7 +93,7 @@ def test_all_blocks_get_masks_with_named_parameters(flotilla_run: Path, octave: 
 
 
 def test_the_script_runs_again(flotilla_run: Path, octave: Octave) -> None:
-    """While its library is open. Seen to fail without close_system."""
+    """While its library is open."""
     made = script(flotilla_run, octave.work, "clock", "gain", "factor=2", "gain", "factor=3")
     again = "state = simulink_state(); state.functions = containers.Map(); simulink_state(state); "
     done = octave.run(f"run('{made}'); {again} run('{made}')")
@@ -176,7 +175,7 @@ GIVEN = "'Station', 'user@station', 'Checkout', '~/my flotilla'"
 
 def test_a_build_is_packed_sent_imported_and_deployed(station: Octave, local_compiler: None, tmp_path: Path) -> None:
     """The archive that arrives becomes an app whose code compiles. Seen to fail with the station computer's directory
-    unquoted, and with the archive left in the home directory."""
+    unquoted, and with the archive left on this computer."""
     there = station.work / "home" / "my flotilla"
     done = station.run(f"flotilla_deploy('three', 'Robot', 3, {GIVEN}, 'Keep', true)", FUNCTION)
     assert done.returncode == 0, done.stdout + done.stderr
