@@ -47,7 +47,7 @@ size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size $(call need,ROBOT)
 
 ##@ Fleet
-.PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down provision update releases
+.PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave
 fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
 	$(Q)$(FLOTILLA) fleet up $(call need,N)
 
@@ -66,6 +66,11 @@ wheeled-down: | setup-tests ## end them
 fleet-scale: | setup-tests ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
 	$(Q)$(FLOTILLA) fleet-scale $(call need,N) $(call option,--board,BOARD)
 
+radio-capacity: | setup ## how many robots one radio cell carries, simulated [INVENTORY=dir STANDARD=b|b-short|g|g-mixed RATE=11M AREA=10 PHASES=random UPDATE=1 LIMIT=10 MISSED=1 COMPUTE=400 SEED=1]
+	$(Q)$(FLOTILLA) radio-capacity $(call option,--inventory,INVENTORY) $(call option,--standard,STANDARD) $(call option,--rate,RATE) \
+	    $(call option,--area,AREA) $(call option,--phases,PHASES) $(if $(filter-out 0,$(UPDATE)),--update) $(call option,--limit,LIMIT) \
+	    $(call option,--missed,MISSED) $(call option,--compute,COMPUTE) $(call option,--seconds,SECONDS) $(call option,--seed,SEED)
+
 update: | setup ## robots take the bundle of their board: make update [ROBOT=3] [ON=guests] [ARGS="-e stop_tasks=true"]
 	$(Q)$(MAKE) provision PLAYBOOK=update
 
@@ -76,10 +81,20 @@ provision: | setup ## robots become what the inventory says: make provision [ROB
 releases: | setup ## which release each robot runs, since when, on trial or confirmed: make releases [ROBOT=3] [JSON=1]
 	$(Q)$(FLOTILLA) releases $(if $(value ROBOT),$(call given,ROBOT)) $(if $(filter-out 0,$(JSON)),--json)
 
+station-join: | setup ## put this computer's 802.11 adapter into the robots' ad hoc cell: make station-join [ADAPTER=wlan0] [STATION=]
+	$(Q)$(FLOTILLA) station-join $(if $(value ADAPTER),$(call given,ADAPTER)) $(call option,--station,STATION)
+
+station-leave: | setup ## take it out of the cell, and put everything back: make station-leave [ADAPTER=wlan0]
+	$(Q)$(FLOTILLA) station-leave $(if $(value ADAPTER),$(call given,ADAPTER))
+
 ##@ Apps
-.PHONY: new-app deploy
+.PHONY: new-app import-model deploy
 new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|fmu|make NAME=hover
 	$(Q)$(FLOTILLA) new-app $(call need,KIND) $(call need,NAME)
+
+import-model: | setup ## MATLAB's packNGo archive becomes apps/NAME: ZIP=hover.zip NAME=hover [MODEL=] [SAMPLE_TIMES=0.01,0.05]
+	$(Q)$(FLOTILLA) import-model $(call need,ZIP) $(call need,NAME) $(call option,--model,MODEL) \
+	    $(call option,--sample-times,SAMPLE_TIMES)
 
 deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [ON_ROBOT=1] [KEEP=1 | RUN=start|stop|status|log|remove]
 	$(Q)$(FLOTILLA) deploy $(call need,ROBOT) $(call need,APP) $(call option,--run,RUN) \
@@ -141,7 +156,6 @@ test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU; one tier 
 	    $(PYTHON) -m tests.costs show $(COSTS); exit $$status
 
 test-all: test ## the same, and tests that take minutes for one answer
-	$(Q)images/install-host-packages tests/browser-packages.txt
 	$(Q)$(MAKE) test TIER=nightly
 
 .PHONY: test-kernel test-clock test-others
@@ -195,7 +209,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param scope record live top drive report
+.PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive report
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -228,6 +242,10 @@ bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HA
 	$(Q)images/install-host-packages runtime/bench/packages.txt
 	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(call option,--seconds,SECONDS) \
 	    $(call option,--rounds,ROUNDS)
+
+station: | setup ## a page to see the fleet, drive, tune and record it [PORT=8080 ADDRESS=127.0.0.1 OUT=file INVENTORY=]; show a recording: REPLAY=file
+	$(Q)$(FLOTILLA) station $(call option,--inventory,INVENTORY) $(call option,--port,PORT) $(call option,--page-address,ADDRESS) $(call option,--record,OUT) \
+	    $(call option,--replay,REPLAY) $(call option,--seconds,SECONDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
 station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)

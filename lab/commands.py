@@ -120,6 +120,18 @@ def _power_cuts_arguments(parser: argparse.ArgumentParser) -> None:
     command.arguments(parser)
 
 
+def _radio_capacity(arguments: argparse.Namespace) -> None:
+    from lab.radio import command
+
+    command.run(arguments)
+
+
+def _radio_capacity_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.radio import command
+
+    command.arguments(parser)
+
+
 def _wheeled(arguments: argparse.Namespace) -> None:
     from lab.wheeled import command
 
@@ -154,6 +166,8 @@ COMMANDS = (
     Command("Lab", "scenarios", "fly a robot by four computers and write the report", _scenarios,
             _scenarios_arguments),
     Command("Lab", "scenarios-accept", "fly as the tests do, and accept the latencies of the hops", _scenarios_accept),
+    Command("Lab", "radio-capacity", "simulate how many robots one radio cell carries", _radio_capacity,
+            _radio_capacity_arguments),
     Command("Lab", "power-cuts", "replay every power cut of an update, and judge what starts", _power_cuts,
             _power_cuts_arguments),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Releases that tests bring to robots: what a board ships, with a file /new/bytes besides.
+"""Releases that tests bring to robots: what a board ships, with /new besides: some bytes, and what makes releases bad.
 
 A release that is to go wrong differs from one that does well by its header alone, in a boot argument. So all of them
 have one content, which a robot is sent once, by a delta from what it runs.
@@ -15,8 +15,9 @@ from pathlib import Path
 
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Releases
-from images.builder import bundle, slot
+from images.builder import bundle, runtime, slot
 from images.builder.build import BoardBuild
+from lab.staging.virtual import OVERRUN
 
 SEED, NEW_BYTES = 1, 2 << 20
 """What a delta cannot take from what a robot has: about as much as when a library of many programs is replaced."""
@@ -28,8 +29,19 @@ ARGUMENTS: Mapping[str, tuple[str, str]] = {
     "no network": ("quiet", "quiet module_blacklist=e100"),
     # The eight-port board's ports have no driver.
     "dead sensor": ("8250.nr_uarts=16", "8250.nr_uarts=4"),
+    "overruns": ("quiet", "quiet systemd.setenv=LD_PRELOAD=/new/overrun.so"),
+    "service manager hangs": (PREINIT, "init=/new/freeze"),
 }
 """How bad releases go wrong: a boot argument, and what stands in its place."""
+FREEZE = """#!/bin/busybox sh
+# The shipped first program, and a fault that the service manager does not survive: it freezes then, and serves nothing.
+(
+    until busybox pidof sshd >/dev/null; do busybox sleep 1; done
+    busybox sleep 5
+    kill -SEGV 1
+) &
+exec /usr/lib/flotilla/preinit "$@"
+"""
 
 
 @dataclass(frozen=True)
@@ -68,6 +80,10 @@ def successor(made: BoardBuild, releases: Releases, directory: Path) -> Content:
     for each in (root, new, out):
         each.mkdir()
     (new / "bytes").write_bytes(random.Random(SEED).randbytes(NEW_BYTES))
+    (new / "overrun.so").write_bytes(runtime.compile_plugin(OVERRUN, made.board.architecture))
+    (new / "freeze").write_text(FREEZE)
+    for program in ("overrun.so", "freeze"):
+        (new / program).chmod(0o755)
     for file in made.root.iterdir():
         shutil.copyfile(file, root / file.name)
     squashfs = root / "root.squashfs"

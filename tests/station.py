@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import itertools
 import os
+import re
 import shutil
 import socket
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -39,23 +40,30 @@ Messages = list[tuple[str, Any]]
 """Topic and decoded message."""
 
 
-def on_loopback(directory: Path, begin: str = LOOPBACK) -> Path:
-    """The scenarios' fleet on this computer's loopback, in an inventory that is made; its addresses `begin` so."""
-    shutil.copytree(FLEET, directory)
+def on_loopback(directory: Path, begin: str = LOOPBACK, fleet: Path = FLEET) -> Path:
+    """The scenarios' fleet, or another one, on this computer's loopback, in an inventory that is made; its addresses
+    `begin` so."""
+    shutil.copytree(fleet, directory)
     for file in (directory / "robots.yml", directory / "group_vars" / "all.yml"):
-        file.write_text(file.read_text().replace("170.160.1.", begin))
+        file.write_text(re.sub(r"170\.160\.1\.|10\.43\.0\.", begin, file.read_text()))
     return directory
 
 
 @contextmanager
 def station(
-    fleet: Path, command: str, *options: str | Path, under: tuple[str, ...] = ()
+    fleet: Path,
+    command: str,
+    *options: str | Path,
+    under: tuple[str, ...] = (),
+    environment: Mapping[str, str] | None = None,
+    address: str = ADDRESS,
 ) -> Iterator[subprocess.Popen[str]]:
-    """`flotilla COMMAND` with `options`, run by the command line `under`."""
-    argv = [*under, sys.executable, "-m", "flotilla", command, *options, "--inventory", fleet, "--address", ADDRESS]
+    """`flotilla COMMAND` with `options`, run by the command line `under`. `environment`: besides this one's."""
+    argv = [*under, sys.executable, "-m", "flotilla", command, *options, "--inventory", fleet, "--address", address]
     with subprocess.Popen(
-        argv, cwd=paths.PROJECT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+        argv, cwd=paths.PROJECT, env=os.environ | (environment or {}), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    ) as process:  # fmt: skip
         try:
             yield process
         finally:

@@ -27,6 +27,7 @@ LONGEST = (
     "test_deploy.py",
     "test_accidents.py",
     "test_scenarios.py",
+    "test_update_virtual.py",
     "test_latency.py",
     "test_verify.py",
     "test_build.py",

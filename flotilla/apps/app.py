@@ -77,6 +77,10 @@ class Ert(_Description):
     sample_times: list[float] = []
     """Sample times of the model's step functions in seconds, fastest first. Needed where comments in the code lack
     them."""
+    tasking: Literal["threads", "single"] | None = None
+    """How a model with several rates runs. `threads`: each slower rate in a thread of lower priority, which it may
+    need all of its period for. `single`: all in one thread, within the fastest period. When left out: threads where
+    the code has a function for each rate and calls no block of the runtime."""
 
 
 class Fmu(_Description):

@@ -39,7 +39,8 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
                 with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".ert-") as work:
                     source = Path(work) / "source"
                     model, times_s = description.model, description.sample_times
-                    ert.block(subject.directory, model, subject.name, times_s, source, board.architecture)
+                    tasking = description.tasking
+                    ert.block(subject.directory, model, subject.name, times_s, source, board.architecture, tasking)
                     try:
                         _blocks(subject, source, ("-Wall",), board.architecture, out, run)
                     except UserError as error:

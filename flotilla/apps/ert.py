@@ -13,7 +13,7 @@ import math
 import re
 import shutil
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -112,6 +112,8 @@ class Signal:
     width: int
     place: str
     """Where the model has it, as C."""
+    rate: int = field(default=0, kw_only=True)
+    """Which of the model's threads reads or writes it: 0 is the block's step, others as in `Model.slower`."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,8 @@ class Step:
     """Runs in each so many-th step of the fastest rate."""
     result: str = ""
     """Where what it returns goes."""
+    number: int | None = None
+    """The rate's, where one function is given it (tid)."""
 
 
 @dataclass(frozen=True)
@@ -180,13 +184,38 @@ class Model:
     """A global variable of the model; because of it a task can have one such block only."""
     inner: bool = False
     """It calls blocks of the runtime."""
+    threads: bool = False
+    """Each slower rate has a thread."""
+
+    @property
+    def own(self) -> list[Step]:
+        """Steps that the block's step calls itself."""
+        return [step for step in self.steps if step.every == 1 or not self.threads]
+
+    @property
+    def slower(self) -> list[Step]:
+        """Steps with threads, fastest first."""
+        return sorted((step for step in self.steps if step not in self.own), key=lambda step: step.every)
 
 
-def block(directory: Path, model: str, name: str, sample_times_s: list[float], out: Path, architecture: str) -> None:
-    """Fill `out` with the C files of a plug-in for Debian's `architecture`, whose block is `name`."""
+def block(
+    directory: Path,
+    model: str,
+    name: str,
+    sample_times_s: list[float],
+    out: Path,
+    architecture: str,
+    tasking: str | None = None,
+) -> None:
+    """Fill `out` with the C files of a plug-in for Debian's `architecture`, whose block is `name`.
+
+    `tasking`: the key of app.yml.
+    """
     code = collect(directory / GENERATED, model, out)
     found = read(model, preprocess(out, model, code, architecture), code, sample_times_s)
     found.inner = (out / INNER).is_file()
+    if tasking != "single":
+        separate(found, code, wanted=tasking == "threads")
     (out / "flotilla_block.c").write_text(render(found, name))
 
 
@@ -269,6 +298,100 @@ def render(model: Model, name: str) -> str:
     )
     environment.filters["written"] = _written
     return environment.from_string(TEMPLATE.read_text()).render(model=model, name=name)
+
+
+def separate(model: Model, code: Code, *, wanted: bool) -> None:
+    """Give each slower rate a thread where the code permits it; UserError where it does not, and that is `wanted`.
+
+    Root ports are in structures that all rates share. The coder gives a port one sample time, so the functions of one
+    rate use it; only at that rate's releases is it copied.
+    """
+    model.threads = True
+    if not model.slower or model.inner:
+        model.threads = False
+        if wanted:
+            reason = "its blocks of the runtime run in one thread" if model.inner else "it has one rate"
+            raise UserError(f"{GENERATED}/{model.name}.h: tasking: threads: {reason}; leave the key out")
+        return
+    bodies = _bodies(code.sources)
+    roots = [[step.function for step in model.own], *([step.function] for step in model.slower)]
+    if any(step.number is not None for step in model.slower):  # one function that is given the rate
+        roots = [
+            [f"{model.name}_step{step.number}" for step in steps]
+            for steps in (model.own, *([each] for each in model.slower))
+        ]
+    missing = [name for names in roots for name in names if name not in bodies]
+    if missing:
+        model.threads = False
+        if wanted:
+            remedy = "one function for all rates runs in one thread; leave the key out"
+            raise UserError(f"{GENERATED}/{model.name}.c: tasking: threads: has no function {missing[0]}; {remedy}")
+        return
+    used = [_reached(bodies, names) for names in roots]
+    model.inputs = [_owned(model, signal, used, code.sources) for signal in model.inputs]
+    model.outputs = [_owned(model, signal, used, code.sources) for signal in model.outputs]
+
+
+def _owned(model: Model, signal: Signal, used: list[str], sources: str) -> Signal:
+    """The port with the rate whose functions name it."""
+    field_of = re.search(r"\.(\w+)$", signal.place)
+    if signal.place.startswith("instance->arguments.") or not field_of:
+        pattern = rf"(?<![.>\w]){re.escape(signal.place.rpartition('.')[2])}\b"
+    else:
+        role = "inputs" if signal in model.inputs else "outputs"
+        kinds = "|".join(_ROLES[role])
+        # Whatever is of the structure's type: the variable, a pointer to it, an argument.
+        names = set(re.findall(rf"\b(?:{kinds})(?:_\w+)?\s*\*?\s*(?:const\s+)?(\w+)\s*[;,)=]", _plain(sources)))
+        if not signal.place.startswith("instance->"):
+            names.add(re.sub(r"\W", "", signal.place.rpartition(".")[0]))
+        if not names:
+            return signal
+        pattern = rf"\b(?:{'|'.join(sorted(names))})\s*(?:\.|->)\s*{re.escape(field_of[1])}\b"
+    rates = [number for number, text in enumerate(used) if re.search(pattern, text)]
+    if len(rates) > 1:
+        times = " and ".join(f"every {[model.own[0], *model.slower][rate].every}." for rate in rates)
+        remedy = "give the port one sample time, with a Rate Transition block behind it, or say tasking: single"
+        raise UserError(
+            f"{GENERATED}/{model.name}.c: the root port {signal.name} is used in {times} step of the block; {remedy}"
+        )
+    return replace(signal, rate=rates[0] if rates else 0)
+
+
+def _plain(sources: str) -> str:
+    """Without comments, strings and directives."""
+    text = re.sub(r'"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'', '""', _COMMENT.sub(" ", sources))
+    return re.sub(r"^[ \t]*#(?:[^\n]*\\\n)*[^\n]*", "", text, flags=re.M)
+
+
+def _bodies(sources: str) -> dict[str, str]:
+    """Heads and bodies of the functions that are defined, by name."""
+    text, found = _plain(sources), dict[str, str]()
+    depth, begin, head = 0, 0, ""
+    for match in re.finditer(r"[{};]", text):
+        if match[0] == "{":
+            if depth == 0:
+                head, begin = text[begin : match.start()], match.end()
+            depth += 1
+        elif match[0] == "}":
+            depth -= 1
+            if depth == 0:
+                named = re.search(r"(\w+)\s*\(", head) if head.rstrip().endswith(")") else None
+                if named:
+                    found[named[1]] = f"{found.get(named[1], '')}{head}{text[begin : match.start()]}\n"
+                begin = match.end()
+        elif depth == 0:
+            begin = match.end()
+    return found
+
+
+def _reached(bodies: dict[str, str], names: list[str]) -> str:
+    """What those functions and all that they call consist of."""
+    reached = list(dict.fromkeys(names))
+    for name in reached:
+        reached += [
+            each for each in dict.fromkeys(re.findall(r"\w+", bodies[name])) if each in bodies and each not in reached
+        ]
+    return "".join(bodies[name] for name in reached)
 
 
 def _cplusplus(model: str) -> UserError:
@@ -357,7 +480,8 @@ class _Reader:
         found.terminate = self._call(end, 0) if end in self.functions else None
         for name, number, every in functions:
             result = self._returned(found, self.functions[name].type)
-            found.steps.append(Step(name, self._call(name, number), every, result))
+            given = number if "tid" in self._parameter_names(name) and name.endswith("_step") else None
+            found.steps.append(Step(name, self._call(name, number), every, result, given))
         found.period_s = self.period_s
         return found
 

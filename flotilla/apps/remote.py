@@ -300,7 +300,17 @@ def summary(statistics: dict[str, Any]) -> list[str]:
         f"{statistics['overruns']} overruns, {statistics['skipped']} skipped",
         f"jitter: {times(statistics['jitter'])}",
         f"step:   {times(statistics['step'])}",
-        *(f"  {block}: {times(what)}" for block, what in statistics.get("blocks", {}).items()),
+        *(
+            line
+            for block, what in statistics.get("blocks", {}).items()
+            for line in (
+                f"  {block}: {times(what)}",
+                *(
+                    f"    {rate['name']}, every {rate['every']} steps: {times(rate)}, {rate['overruns']} overruns"
+                    for rate in what.get("rates", [])
+                ),
+            )
+        ),
     ]
 
 

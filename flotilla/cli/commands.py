@@ -273,6 +273,26 @@ def _new_app_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", help="of the app, and of its directory in apps/")
 
 
+def _import_model(arguments: argparse.Namespace) -> None:
+    from flotilla.apps import imported
+    from flotilla.fleet import inventory
+
+    architectures = sorted({board.architecture for board in inventory.load_fleet().boards.values()})
+    times_s = arguments.sample_times or []
+    print(imported.create(arguments.archive, arguments.name, architectures, arguments.model, times_s))
+
+
+def _import_model_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("archive", type=Path, metavar="zip", help="what packNGo(buildInfo) made in MATLAB")
+    parser.add_argument("name", help="of the app, and of its directory in apps/")
+    parser.add_argument("--model", help="its name, where the archive has several")
+    parser.add_argument("--sample-times", type=_seconds, metavar="S,…", help="in seconds, fastest first, for a new app")
+
+
+def _seconds(text: str) -> list[float]:
+    return [float(each) for each in text.split(",")]
+
+
 def _deploy(arguments: argparse.Namespace) -> None:
     import functools
 
@@ -310,6 +330,30 @@ def _record_arguments(parser: argparse.ArgumentParser) -> None:
     command.record_arguments(parser)
 
 
+def _station_join(arguments: argparse.Namespace) -> None:
+    from flotilla.station import cell
+
+    cell.join(arguments)
+
+
+def _station_join_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import cell
+
+    cell.join_arguments(parser)
+
+
+def _station_leave(arguments: argparse.Namespace) -> None:
+    from flotilla.station import cell
+
+    cell.leave(arguments)
+
+
+def _station_leave_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import cell
+
+    cell.leave_arguments(parser)
+
+
 def _live_arguments(parser: argparse.ArgumentParser) -> None:
     from flotilla.station import command
 
@@ -332,6 +376,18 @@ def _drive_arguments(parser: argparse.ArgumentParser) -> None:
     from flotilla.station import drive
 
     drive.drive_arguments(parser)
+
+
+def _page(arguments: argparse.Namespace) -> None:
+    from flotilla.station import page_command
+
+    page_command.run(arguments)
+
+
+def _page_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import page_command
+
+    page_command.page_arguments(parser)
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -393,12 +449,19 @@ COMMANDS = (
     Command("Robots", "releases", "show which release each robot runs", _releases, _releases_arguments),
     Command("Robots", "hwcheck", "report a robot's hardware", _hwcheck, _hwcheck_arguments),
     Command("Robots", "provision", "make robots what the inventory says", _provision, _provision_arguments),
+    Command("Robots", "station", "serve a page to see the fleet, drive and record it", _page, _page_arguments),
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments),
     Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments),
     Command("Robots", "top", "show it as a table", _station, _top_arguments),
+    Command("Robots", "station-join", "put this computer's 802.11 adapter into the robots' cell", _station_join,
+            _station_join_arguments),
+    Command("Robots", "station-leave", "take it out, and put everything back", _station_leave,
+            _station_leave_arguments),
     Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
+    Command("Apps", "import-model", "make an app of what MATLAB's packNGo packed, or renew its code", _import_model,
+            _import_model_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
     Command("Shell", "completion", "print what makes a shell complete these words", _completion,
             _completion_arguments),

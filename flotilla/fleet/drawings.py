@@ -53,6 +53,7 @@ class Drawing:
             raise DrawingError(
                 ("type",), "is no schema of Foxglove", "such as CompressedImage, Grid, LaserScan or PoseInFrame"
             )
+        self.drawn = drawn
         schema = schemas()[drawn.type]
         self.name: str = schema.name
         self.data: bytes = schema.data

@@ -3,10 +3,8 @@ stop of control tasks."""
 
 from __future__ import annotations
 
-import shlex
-import subprocess
+from collections.abc import Sequence
 
-from flotilla.common.errors import UserError
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 
@@ -17,19 +15,9 @@ def param(robot: Robot, task: str, parameter: str | None = None, value: str | No
     UserError with the robot's reason, or when it does not answer.
     """
     words = ["flotilla-param", task, *([parameter] if parameter else []), *([value] if value is not None else [])]
-    return _output(robot, words)
+    return ssh.output(robot, words)
 
 
-def service(robot: Robot, task: str, do: str) -> str:
-    """Start or stop a control task, as the playbook `tasks.yml` does. UserError as above."""
-    return _output(robot, ["sudo", "systemctl", do, f"flotilla-task@{task}.service"])
-
-
-def _output(robot: Robot, words: list[str]) -> str:
-    argv = [*ssh.command(robot), shlex.join(words)]
-    done = subprocess.run(argv, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False)
-    if done.returncode == ssh.FAILED:
-        raise ssh.no_answer(robot, done.stderr.strip())
-    if done.returncode:
-        raise UserError(f"{robot.name}: {done.stderr.strip().removeprefix('flotilla-param: ')}")
-    return done.stdout.rstrip("\n")
+def service(robot: Robot, tasks: Sequence[str], do: str) -> str:
+    """Start or stop control tasks, all at once, as the playbook `tasks.yml` does. UserError as above."""
+    return ssh.output(robot, ["sudo", "systemctl", do, *(f"flotilla-task@{task}.service" for task in tasks)])

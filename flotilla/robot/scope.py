@@ -26,6 +26,11 @@ def words(
     return [_PROGRAM, *given, *(["--csv"] if csv else []), "--", task, *signals]
 
 
+def signals(robot: Robot, task: str) -> str:
+    """All signals of a task that runs, a line each: name, type, number of elements, unit. UserError as below."""
+    return ssh.output(robot, [_PROGRAM, "--", task])
+
+
 def show(robot: Robot, command: Sequence[str]) -> None:
     """Print what the command says until it ends. UserError when the robot refuses or does not answer."""
     _run(robot, command, None)

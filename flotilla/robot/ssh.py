@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shlex
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +17,8 @@ from flotilla.fleet.model import Robot
 
 FAILED = 255
 """Status of `ssh` when there is no connection; every other one is the command's."""
+PATIENCE_S = 120
+"""A service that stops may take 90 s, systemd's own limit."""
 RUN = paths.BUILD / "run"
 """What `make boot` and `make fleet` tell `make ssh`: the port, in a file that means something only while locked."""
 
@@ -36,6 +40,23 @@ def command(robot: Robot) -> list[str]:
     """`ssh` to the robot's guest when one runs, else to the robot."""
     port = forwarded_port(robot)
     return ["ssh", *options(robot), *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)])]
+
+
+def output(robot: Robot, words: Sequence[str]) -> str:
+    """What a command on the robot prints, without the last line's end; what it says on stderr, as UserError, when it
+    fails, or when it lasts longer than PATIENCE_S. A program's name before its message is left out."""
+    argv = [*command(robot), shlex.join(words)]
+    try:
+        done = subprocess.run(
+            argv, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False, timeout=PATIENCE_S
+        )
+    except subprocess.TimeoutExpired:
+        raise no_answer(robot, f"nothing within {PATIENCE_S} s") from None
+    if done.returncode == FAILED:
+        raise no_answer(robot, done.stderr.strip())
+    if done.returncode:
+        raise UserError(f"{robot.name}: {done.stderr.strip().removeprefix(f'{words[0]}: ')}")
+    return done.stdout.rstrip("\n")
 
 
 def options(robot: Robot) -> list[str]:

@@ -84,7 +84,7 @@ class Dialog:
         (robot, task), do = self._leave(), self._do
         what = f"{do} {robot} {task}"
         if key == "y":
-            self._act(what, robot, lambda there: parameters.service(there, task, do) or "done")
+            self._act(what, robot, lambda there: parameters.service(there, [task], do) or "done")
         else:
             self._answer = f"{what}: left as it is"
 

@@ -63,9 +63,9 @@ def read(file: Path) -> list[Topic]:
 def _read(opened: IO[bytes]) -> list[Topic]:
     kinds: dict[int, type[Any]] = {}
     topics: dict[str, _Rows] = {}
-    for schema, topic, data, time_ns in _messages(opened):
+    for schema, topic, data, time_ns in messages(opened):
         if schema.id not in kinds:
-            kinds[schema.id] = _message_class(schema)
+            kinds[schema.id] = message_class(schema)
         message = kinds[schema.id].FromString(data)
         names = [each.name for each in message.DESCRIPTOR.fields if _is_number(each)]
         rows = topics.setdefault(topic, _Rows(names))
@@ -81,14 +81,14 @@ def _read(opened: IO[bytes]) -> list[Topic]:
     ]
 
 
-def _messages(opened: IO[bytes]) -> Iterator[tuple[Schema, str, bytes, int]]:
+def messages(opened: IO[bytes]) -> Iterator[tuple[Schema, str, bytes, int]]:
     with suppress(EndOfFile):  # whoever recorded it was killed, or records still
         for schema, channel, message in NonSeekingReader(opened).iter_messages(log_time_order=False):
             if schema and schema.encoding == channel.message_encoding == ENCODING:
                 yield schema, channel.topic, message.data, message.log_time
 
 
-def _message_class(schema: Schema) -> type[Any]:
+def message_class(schema: Schema) -> type[Any]:
     pool = descriptor_pool.DescriptorPool()
     for each in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
         pool.Add(each)

@@ -66,8 +66,11 @@ class Receiver:
         if len(datagram) != stream.length:
             count.refused += 1
             return
-        count.received += 1
-        values = stream.unpack(datagram)
+        self.hand(stream, stream.unpack(datagram), received_ns)
+
+    def hand(self, stream: Stream, values: Mapping[str, Value], received_ns: int) -> None:
+        """A message to all sinks."""
+        self.counts[stream.topic].received += 1
         for sink in self.sinks:
             sink.take(stream, values, received_ns)
 

@@ -28,7 +28,7 @@ class Schema:
         name = "".join(word.capitalize() for word in f"{stream.task}-{stream.name}".replace("_", "-").split("-"))
         message = file.message_type.add(name=name)
         for number, field in enumerate(stream.fields, 1):
-            described = message.field.add(name=_identifier(field.name), number=number)
+            described = message.field.add(name=identifier(field.name), number=number)
             described.type = getattr(descriptor_pb2.FieldDescriptorProto, f"TYPE_{_TYPES[field.type]}")
             described.label = (
                 descriptor_pb2.FieldDescriptorProto.LABEL_REPEATED if field.width > 1
@@ -43,7 +43,7 @@ class Schema:
 
     def encode(self, values: Mapping[str, Value], received_ns: int) -> bytes:
         """A message of these values, which `Stream.unpack` gave."""
-        message = self._message(**{_identifier(name): value for name, value in values.items()})
+        message = self._message(**{identifier(name): value for name, value in values.items()})
         encoded: bytes = message.SerializeToString()
         return encoded
 
@@ -54,5 +54,6 @@ def topics(stream: Stream) -> dict[str, Schema | Drawing]:
     return {stream.topic: Schema(stream), **drawings}
 
 
-def _identifier(name: str) -> str:
+def identifier(name: str) -> str:
+    """A signal's name, as protobuf has it."""
     return name.replace("-", "_")

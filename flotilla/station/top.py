@@ -29,7 +29,7 @@ from flotilla.station.telemetry import Stream
 WINDOW_NS = 2_000_000_000
 _LATE = 10
 """Datagrams by which one may be overtaken, what is further back is a start anew; that may stay away unremarked."""
-_HEALTH = ("good", "flag")
+HEALTH = ("good", "flag")
 """Names, or ends of them, of flags that are true when all is well."""
 _GOOD_LINK = 0.9
 _LOW_CHARGE = 0.2
@@ -70,6 +70,10 @@ class Row:
     """The battery's last, 0 to 1; None where the stream has none."""
     flags: dict[str, float]
     """By the names of boolean signals: in which part of the datagrams each was true, 0 to 1."""
+
+    def silent(self, stream: Stream) -> bool:
+        """Whether nothing came of its stream for as long as ten datagrams take."""
+        return self.age_s is None or self.age_s * stream.rate_hz > _LATE
 
 
 class _Came(NamedTuple):
@@ -202,7 +206,7 @@ class Top:
             table.add_column(title, justify="left" if title in _LEFT else "right")
         for stream in self._known:
             row, count = self._stats[stream.topic].row(now_ns), self._receiver.counts[stream.topic]
-            silent = row.age_s is None or row.age_s * stream.rate_hz > _LATE
+            silent = row.silent(stream)
             sent = count.received + (row.lost or 0)
             table.add_row(
                 stream.robot,
@@ -252,7 +256,7 @@ def _asked(state: State | None) -> list[Text]:
 def _flag(name: str, share: float) -> Text:
     """`good`, `not good`, or `good 98 %` for one that changed."""
     text = name if share == 1 else f"not {name}" if share == 0 else f"{name} {int(100 * share)} %"
-    return _marked(text, name.endswith(_HEALTH) and share < 1)
+    return _marked(text, name.endswith(HEALTH) and share < 1)
 
 
 def _sensor(name: str, flag: bool) -> Text:

@@ -129,6 +129,21 @@ class Block:
         return total.to_bytes(SYMBOL, "little")
 
 
+def symbol(transfer: int, number: int, which: int, block: Block) -> bytes:
+    """The datagram with symbol `which` of the transfer's block `number`."""
+    return _HEADER.pack(transfer, number, which) + block.symbol(which)
+
+
+def question(transfer: int, number: int, robots: Sequence[str]) -> bytes:
+    """The datagram that asks robots, by their addresses, what they lack."""
+    return _HEADER.pack(transfer, _QUESTION, number) + b"".join(IPv4Address(address).packed for address in robots)
+
+
+def end(transfer: int) -> bytes:
+    """The datagram after which nothing comes any more."""
+    return _HEADER.pack(transfer, _END, 0)
+
+
 @dataclass
 class _Robot:
     """What is known of a robot."""
@@ -247,7 +262,7 @@ class Sender:
                     told = time.monotonic()
                     watch(self._report(told - began))
             for _ in range(3):  # a robot that hears none of them ends by itself
-                self._send(_HEADER.pack(self._transfer, _END, 0))
+                self._send(end(self._transfer))
         return self._report(time.monotonic() - began)
 
     def _report(self, seconds: float) -> Report:
@@ -290,8 +305,7 @@ class Sender:
             return False
         job = self._jobs[0]
         number = job.numbers.popleft()
-        content = self._block(job.block).symbol(number)
-        self._send(_HEADER.pack(self._transfer, job.block, number) + content)
+        self._send(symbol(self._transfer, job.block, number, self._block(job.block)))
         self._symbols_sent += 1
         if not job.numbers:
             self._jobs.popleft()
@@ -320,9 +334,8 @@ class Sender:
         for address in asked:
             self._robots[address].answered = False
         self._question = self._question % 0xFFFF + 1
-        packed = b"".join(IPv4Address(address).packed for address in asked[: SYMBOL // 4])
         self._sent_since.clear()
-        self._send(_HEADER.pack(self._transfer, _QUESTION, self._question) + packed)
+        self._send(question(self._transfer, self._question, asked[: SYMBOL // 4]))
         self._asked_at, self._wait_s = time.monotonic(), len(asked) * _SLOT_S + _PATIENCE_S
 
     def _left_s(self) -> float:

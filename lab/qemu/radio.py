@@ -24,6 +24,8 @@ from flotilla.common import paths
 from lab.qemu.qemu import Wire
 
 _TCP = 6
+_GROUPS = b"\x01\x00\x5e"
+"""What hardware addresses of IPv4's groups begin with."""
 
 _NODE = """
 import array, fcntl, os, socket, struct, subprocess, sys
@@ -107,6 +109,8 @@ class Radio:
         }
         self.sent: dict[str, list[int]] = {address: [] for address in addresses}
         """Sizes of the frames that each node sent, in bytes from the Ethernet header on."""
+        self.deaf: set[str] = set()
+        """Members that no multicast over IPv4 reaches; all else does."""
         self.lost = self.carried = self.overrun = 0
         self.lossy_bytes = 0
         """Bytes of all frames that may be lost, from the Ethernet header on."""
@@ -152,13 +156,15 @@ class Radio:
         self._places[frame[6:12]] = sender
         place = self._places.get(frame[:6])
         receivers: Collection[str] = self._ends_of if place is None else (place,)
+        to_a_group = frame[:3] == _GROUPS
         repeated = frame[12:14] == b"\x08\x00" and frame[23] == _TCP
         self.lossy_bytes += 0 if repeated else len(frame)
         for receiver in receivers:
             if receiver == sender:
                 continue
             self.carried += 1
-            if not repeated and self._chance[sender, receiver].random() < self._loss:
+            lost = not repeated and self._chance[sender, receiver].random() < self._loss
+            if lost or (to_a_group and receiver in self.deaf):
                 self.lost += 1
                 continue
             try:

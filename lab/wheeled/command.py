@@ -68,5 +68,7 @@ def said(there: Live, room: str) -> str:
         f"in room {room}: {robots}\n"
         f"commands go to UDP port {there.robots[0].command_address[1]} there; reports come to port {there.report_port} "
         f"of {there.station_address}, or of any address\n"
-        f"command: make drive ROBOT=1 {where}    watch: make top {where}    end: Ctrl-C or make wheeled-down"
+        f"drive in a browser: make station {where} KEYS={paths.shown(paths.KEYS)}\n"
+        f"by keys or gamepad: make drive ROBOT=1 {where}\n"
+        f"watch: make top {where}    record: make record {where}    end: Ctrl-C or make wheeled-down"
     )

@@ -217,8 +217,8 @@ class Live:
 
     @property
     def report_port(self) -> int:
-        """UDP port of their reports."""
-        (port,) = {stream.port for stream in self._streams.values()}
+        """UDP port of what their tasks `drive` report."""
+        (port,) = {stream.port for stream in self._streams.values() if stream.task == "drive"}
         return port
 
     def report(self, index: int = 0) -> dict[str, Any]:

@@ -144,8 +144,7 @@ def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str
 
 
 def _stream(described: Fleet) -> telemetry.Stream:
-    (stream,) = telemetry.streams(described)
-    return stream
+    return next(stream for stream in telemetry.streams(described) if stream.task == "drive")
 
 
 def drive(courses: Sequence[Course], board: Board, out: Path) -> dict[str, Driven]:

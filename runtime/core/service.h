@@ -30,6 +30,14 @@ struct fl_service {
     struct fl_inner *inner;                              /* the last one first */
     void (*destroy_inner)(const struct fl_block *outer); /* NULL: it has none */
     bool inner_failed;
+
+    /* The block's slower rates (flotilla/rates.h), which the executive keeps. */
+    struct fl_rates *rates;                          /* NULL: it has none */
+    bool rates_in_turn;                              /* each run ends before the step does */
+    int64_t overruns;                                /* so many in a row of one rate end the task; 0: never */
+    void (*overran)(void *context, int64_t late_ns); /* counts one; in the thread of the step */
+    void *overran_context;
+    bool overrun_ends; /* why the step failed */
 };
 
 /* Call enter(argument) with a stack beside it for signal handlers, so that they can run when the own stack of the

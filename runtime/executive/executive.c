@@ -4,6 +4,7 @@
 #include "block.h"
 #include "device.h"
 #include "privilege.h"
+#include "rates.h"
 #include "safety.h"
 #include "sampler.h"
 #include "schedule.h"
@@ -24,7 +25,6 @@
 #include <unistd.h>
 
 enum {
-    STACK_BYTES = 128 * 1024, /* touched before the first step */
     WATCH_MS = 20,
     CATCH_UP_PERIODS = 10, /* further behind, the remaining steps are skipped */
     HOLDER_MS = 1000,      /* wait for another process to release a device, when only making outputs safe */
@@ -132,11 +132,32 @@ unsigned executive_make_safe(struct task *task)
 
 /* --- control thread --- */
 
-static void touch_stack(void)
+/* Bring the slower rates of blocks to the processor of this thread, where priorities decide which of them runs. */
+static void gather_rates(const struct executive *executive)
 {
-    volatile unsigned char stack[STACK_BYTES];
-    for (size_t i = 0; i < sizeof stack; i += 1024)
-        stack[i] = 0;
+    for (size_t i = 0; i < executive->task->count; i++) {
+        const struct fl_block *block = executive->task->blocks[i].block;
+        int error = block->service->rates && !block->service->rates_in_turn ? rates_gather(block) : 0;
+        if (!error)
+            continue;
+        fprintf(stderr, "%s: its rates cannot share one processor (%s): each step waits for the slower ones\n",
+                block->name, strerror(error));
+        rates_in_turn(block);
+    }
+}
+
+static void relax_rates(const struct task *task)
+{
+    for (size_t i = 0; i < task->count; i++)
+        rates_relax(task->blocks[i].block);
+}
+
+/* A slower rate of a block still runs when it is due again. */
+static void rate_overran(void *context, int64_t late_ns)
+{
+    const struct executive *executive = context;
+    executive->result->overruns++;
+    executive->result->last_overrun = (struct overrun_of_step){executive->result->steps, fl_now_ns(), late_ns};
 }
 
 static bool asked_to_stop(struct executive *executive)
@@ -237,7 +258,8 @@ static void *control(void *argument)
     struct run_result *result = executive->result;
     int64_t in_a_row = 0, period_ns = executive->task->period_ns;
     safety_step_begin();
-    touch_stack();
+    privilege_touch_stack();
+    gather_rates(executive);
     /* Skip whole periods, so that the tasks of one computer keep their phases relative to each other. */
     int64_t expected_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
     while (!asked_to_stop(executive)) {
@@ -253,7 +275,11 @@ static void *control(void *argument)
         int64_t now_ns = fl_now_ns(); /* what watchers cost counts as the step's */
         statistics_add(&result->step, now_ns - begin_ns);
         if (failed)
-            end(result, failed->service->ended ? ENDING_DONE : ENDING_FAILED, failed, failed->service->failure);
+            end(result,
+                failed->service->ended          ? ENDING_DONE
+                : failed->service->overrun_ends ? ENDING_OVERRUN
+                                                : ENDING_FAILED,
+                failed, failed->service->failure);
         else if (executive->watch)
             sampler_put(executive->watch, result->steps, release_ns, options->no_wait);
         result->steps++;
@@ -269,6 +295,7 @@ static void *control(void *argument)
             break;
     }
     make_outputs_safe(executive->task);
+    relax_rates(executive->task);
     safety_step_end();
     atomic_store(&executive->ended, true);
     eventfd_write(executive->ended_fd, 1);
@@ -447,8 +474,14 @@ static void *run(void *argument)
     if (!options->no_wait)
         privilege_lock_memory();
     int priority = options->no_wait ? 0 : privilege_priority(task->priority, "steps will be late under load");
-    for (size_t i = 0; i < task->count; i++)
-        task->blocks[i].block->service->priority = priority ? priority - 1 : 0;
+    for (size_t i = 0; i < task->count; i++) {
+        struct fl_service *service = task->blocks[i].block->service;
+        service->priority = priority ? priority - 1 : 0;
+        service->rates_in_turn = !priority;
+        service->overruns = task->overrun == OVERRUN_STOP_SAFE ? 1 : task->overruns;
+        service->overran = rate_overran;
+        service->overran_context = executive;
+    }
     if (start_blocks(task, result)) {
         executive->status = status_create(task);
         int error = start_threads(executive, priority, &guarding);
@@ -497,9 +530,11 @@ void executive_write_statistics(const struct task *task, const struct run_result
     fprintf(out, ",\n \"blocks\": {");
     for (size_t i = 0; i < task->count; i++) {
         const struct task_block *task_block = &task->blocks[i];
-        fprintf(out, "%s\n  \"%s\": {\"count\": %" PRIu64 ", \"mean_ns\": %" PRId64 ", \"max_ns\": %" PRId64 "}",
+        fprintf(out, "%s\n  \"%s\": {\"count\": %" PRIu64 ", \"mean_ns\": %" PRId64 ", \"max_ns\": %" PRId64,
                 i ? "," : "", task_block->block->name, task_block->timing.count, task_block->timing.mean_ns,
                 task_block->timing.max_ns);
+        rates_write(task_block->block, out);
+        fprintf(out, "}");
     }
     fprintf(out, "}}\n");
 }

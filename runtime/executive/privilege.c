@@ -8,7 +8,10 @@
 #include <string.h>
 #include <sys/mman.h>
 
-enum { THREAD_STACK_BYTES = 256 * 1024 };
+enum {
+    THREAD_STACK_BYTES = 256 * 1024,
+    TOUCHED_BYTES = 128 * 1024, /* before the first step */
+};
 
 void privilege_lock_memory(void)
 {
@@ -38,4 +41,11 @@ int privilege_priority(int priority, const char *consequence)
     }
     sched_setscheduler(0, policy, &before);
     return priority;
+}
+
+void privilege_touch_stack(void)
+{
+    volatile unsigned char stack[TOUCHED_BYTES];
+    for (size_t i = 0; i < sizeof stack; i += 1024)
+        stack[i] = 0;
 }

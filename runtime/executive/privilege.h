@@ -10,4 +10,7 @@ void privilege_lock_memory(void);
 /* Returns `priority` where SCHED_FIFO is allowed, otherwise 0 after reporting the consequence. */
 int privilege_priority(int priority, const char *consequence);
 
+/* Touch the stack of the calling thread, as deep as a step may use it. */
+void privilege_touch_stack(void);
+
 #endif

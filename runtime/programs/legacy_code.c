@@ -9,8 +9,10 @@
 #include <flotilla/inner.h>
 #include <stdlib.h>
 #include <string.h>
+#include <strings.h>
 
-#define NAME "flotilla_simulink"
+#define NAME    "flotilla_simulink"
+#define LIBRARY "flotilla_blocks"
 
 enum { NAME_BYTES = 96, REASON_BYTES = 512, PORTS_BYTES = 1024 };
 
@@ -23,14 +25,30 @@ struct subject {
 /* Two languages for one list of arguments: the tool's specification of a function, and the function's head in C. */
 enum language { SPECIFICATION, HEAD };
 
-static const char *c_type(enum fl_type type)
+/* The tool has no integers of 64 bits: each is two of 32, the lower half first, as in the memory of robots. */
+static bool is_halved(const struct fl_port *port)
+{
+    return port->type == FL_INT64 || port->type == FL_UINT64;
+}
+
+static unsigned width_of(const struct fl_port *port)
+{
+    return (unsigned)port->width * (is_halved(port) ? 2 : 1);
+}
+
+static const char *type_of(const struct fl_port *port)
+{
+    return fl_type_name(is_halved(port) ? FL_UINT32 : port->type);
+}
+
+static const char *c_type(const struct fl_port *port)
 {
     static const char *const names[FL_TYPES] = {
-        [FL_BOOLEAN] = "boolean_T", [FL_INT8] = "int8_T",     [FL_UINT8] = "uint8_T",
-        [FL_INT16] = "int16_T",     [FL_UINT16] = "uint16_T", [FL_INT32] = "int32_T",
-        [FL_UINT32] = "uint32_T",   [FL_SINGLE] = "real32_T", [FL_DOUBLE] = "real_T",
+        [FL_BOOLEAN] = "boolean_T", [FL_INT8] = "int8_T",    [FL_UINT8] = "uint8_T",   [FL_INT16] = "int16_T",
+        [FL_UINT16] = "uint16_T",   [FL_INT32] = "int32_T",  [FL_UINT32] = "uint32_T", [FL_SINGLE] = "real32_T",
+        [FL_DOUBLE] = "real_T",     [FL_INT64] = "uint32_T", [FL_UINT64] = "uint32_T",
     };
-    return names[type]; /* NULL: 64 bits, which not all targets of the coder have */
+    return names[port->type];
 }
 
 static bool is_number(const struct fl_parameter *parameter)
@@ -64,15 +82,6 @@ static bool is_masked(const struct subject *subject, const struct fl_parameter *
 /* Whether the Legacy Code Tool cannot have the block; if so, with the reason. */
 static bool refuse(const struct subject *subject, char *reason)
 {
-    const struct fl_block *block = subject->named.block;
-    for (uint32_t i = 0; i < block->in_count + block->out_count; i++) {
-        const struct fl_port *port = i < block->in_count ? &block->in_ports[i] : &block->out_ports[i - block->in_count];
-        if (!c_type(port->type)) {
-            snprintf(reason, REASON_BYTES, "its port %s is of %s, which not every target has; use it in the task file",
-                     port->name, fl_type_name(port->type));
-            return true;
-        }
-    }
     for (uint32_t i = 0; i < subject->named.type->parameter_count; i++) {
         const struct fl_parameter *parameter = &subject->named.type->parameters[i];
         if (parameter->default_value || named_block_value(&subject->named, parameter) || is_masked(subject, parameter))
@@ -135,11 +144,10 @@ static void put_ports(FILE *out, enum language language, const struct fl_port *p
 {
     for (uint32_t i = 0; i < count; i++) {
         if (language == HEAD)
-            fprintf(out, ", %s%s *%c%u", output ? "" : "const ", c_type(ports[i].type), output ? 'y' : 'u',
+            fprintf(out, ", %s%s *%c%u", output ? "" : "const ", c_type(&ports[i]), output ? 'y' : 'u',
                     (unsigned)i + 1);
         else
-            fprintf(out, ", %s %c%u[%u]", fl_type_name(ports[i].type), output ? 'y' : 'u', (unsigned)i + 1,
-                    (unsigned)ports[i].width);
+            fprintf(out, ", %s %c%u[%u]", type_of(&ports[i]), output ? 'y' : 'u', (unsigned)i + 1, width_of(&ports[i]));
     }
 }
 
@@ -174,8 +182,9 @@ static const char *text_of(const char *text)
 static void put_described_ports(FILE *out, const struct fl_port *ports, uint32_t count, char letter)
 {
     for (uint32_t i = 0; i < count; i++)
-        fprintf(out, "%%   %c%u  %s: %s%s%s\n", letter, (unsigned)i + 1, ports[i].name, text_of(ports[i].summary),
-                *text_of(ports[i].unit) ? ", in " : "", text_of(ports[i].unit));
+        fprintf(out, "%%   %c%u  %s: %s%s%s%s\n", letter, (unsigned)i + 1, ports[i].name, text_of(ports[i].summary),
+                *text_of(ports[i].unit) ? ", in " : "", text_of(ports[i].unit),
+                is_halved(&ports[i]) ? "; of 64 bits, in two halves, the lower first" : "");
 }
 
 static void put_described_parameters(FILE *out, const struct subject *subject)
@@ -195,6 +204,92 @@ static void put_described_parameters(FILE *out, const struct subject *subject)
             fprintf(out, "; usually %s", *parameter->default_value ? parameter->default_value : "nothing");
         fputs(is_tunable(parameter) ? "; tunable\n" : "\n", out);
     }
+}
+
+/* As a string of MATLAB. */
+static void put_characters(FILE *out, const char *text)
+{
+    for (; *text; text++)
+        fprintf(out, *text == '\'' ? "''" : "%c", *text);
+}
+
+/* A parameter's name in its mask. Those of MATLAB's language and of blocks have an underscore behind them: Simulink
+ * refuses a name that a block's own parameter has, in any case of letters. */
+static void put_name(FILE *out, const char *name)
+{
+    static const char *const taken[] = {
+        "break",       "case",       "catch",       "continue",   "else",         "end",        "for",
+        "function",    "global",     "if",          "otherwise",  "parfor",       "persistent", "return",
+        "switch",      "try",        "while",       "name",       "type",         "path",       "position",
+        "priority",    "parameters", "ports",       "parent",     "tag",          "handle",     "orientation",
+        "description", "selected",   "permissions", "sampletime", "functionname", "userdata",
+    };
+    fputs(name, out);
+    for (size_t i = 0; i < sizeof taken / sizeof *taken; i++)
+        if (strcasecmp(name, taken[i]) == 0)
+            fputc('_', out);
+}
+
+/* What the mask has until somebody writes something else. */
+static void put_value(FILE *out, const struct fl_parameter *parameter)
+{
+    const char *value = parameter->default_value;
+    if (parameter->kind == FL_KIND_BOOLEAN)
+        fputs(value && strcmp(value, "true") == 0 ? "1" : "0", out);
+    else if (is_number(parameter) && value && strncmp(value, "0x", 2) == 0)
+        fprintf(out, "%llu", strtoull(value, NULL, 16)); /* in MATLAB 0x1 is no double */
+    else if (is_number(parameter))
+        fputs(value ? value : "NaN", out); /* which no block accepts */
+    else if (parameter->kind == FL_KIND_DOUBLES)
+        fprintf(out, "[%s]", text_of(value));
+    else
+        fprintf(out, "uint8(''%s'')", text_of(value));
+}
+
+static void put_mask_parameter(FILE *out, const struct fl_parameter *parameter)
+{
+    fputs("mask.addParameter('Type', 'edit', 'Name', '", out);
+    put_name(out, parameter->name);
+    fprintf(out, "', 'Prompt', '%s: ", parameter->name);
+    put_characters(out, text_of(parameter->summary));
+    if (*text_of(parameter->unit)) {
+        fputs(", in ", out);
+        put_characters(out, parameter->unit);
+    }
+    if (parameter->choices)
+        fprintf(out, " (%s)", parameter->choices);
+    fputs("', 'Value', '", out);
+    put_value(out, parameter);
+    fprintf(out, "', 'Evaluate', 'on', 'Tunable', '%s');\n", is_tunable(parameter) ? "on" : "off");
+}
+
+static void put_block(FILE *out, const struct subject *subject, int index)
+{
+    enum { COLUMNS = 4, STEP_X = 220, STEP_Y = 140, WIDTH = 140, HEIGHT = 80, MARGIN = 40 };
+    const char *shown = subject->function + strlen("flotilla_");
+    const int x = MARGIN + index % COLUMNS * STEP_X, y = MARGIN + index / COLUMNS * STEP_Y;
+    fprintf(out,
+            "\nblock = '" LIBRARY "/%s';\n"
+            "add_block('simulink/User-Defined Functions/S-Function', block, 'Position', [%d %d %d %d]);\n"
+            "mask = Simulink.Mask.create(block);\n"
+            "mask.Type = 'Flotilla %s';\nmask.Description = '",
+            shown, x, y, x + WIDTH, y + HEIGHT, subject->named.type->name);
+    put_characters(out, text_of(subject->named.type->summary));
+    fputs(
+        "';\n"
+        "mask.addParameter('Type', 'edit', 'Name', 'period_s', 'Prompt', 'period_s: period of what calls it, in s; 0: "
+        "the model''s fastest', 'Value', '0', 'Evaluate', 'on', 'Tunable', 'off');\n",
+        out);
+    for (uint32_t i = 0; i < subject->named.type->parameter_count; i++)
+        if (is_masked(subject, &subject->named.type->parameters[i]))
+            put_mask_parameter(out, &subject->named.type->parameters[i]);
+    fprintf(out, "set_param(block, 'FunctionName', '%s', 'Parameters', 'period_s", subject->function);
+    for (uint32_t i = 0; i < subject->named.type->parameter_count; i++)
+        if (is_masked(subject, &subject->named.type->parameters[i])) {
+            fputs(", ", out);
+            put_name(out, subject->named.type->parameters[i].name);
+        }
+    fputs("');\n", out);
 }
 
 static void write_script(FILE *out, const struct subject *subjects, int count)
@@ -232,8 +327,16 @@ static void write_script(FILE *out, const struct subject *subjects, int count)
           "legacy_code('compile', defs);\n"
           "legacy_code('sfcn_tlc_generate', defs);\n"
           "legacy_code('rtwmakecfg_generate', defs);\n"
-          "legacy_code('slblock_generate', defs);\n",
+          "\n% The library: blocks whose masks have the parameters by name.\n"
+          "if bdIsLoaded('" LIBRARY "')\n"
+          "    close_system('" LIBRARY "', 0);\n"
+          "end\n"
+          "load_system('simulink');\n"
+          "new_system('" LIBRARY "', 'Library');\n",
           out);
+    for (int i = 0; i < count; i++)
+        put_block(out, &subjects[i], i);
+    fputs("\nsave_system('" LIBRARY "', fullfile(here, '" LIBRARY ".slx'), 'OverwriteIfChangedOnDisk', true);\n", out);
 }
 
 static void write_header(FILE *out, const struct subject *subjects, int count)
@@ -353,7 +456,7 @@ static void write_simulated(FILE *out, const struct subject *subject)
         fprintf(out, "    (void)u%u;\n", (unsigned)i + 1);
     for (uint32_t i = 0; i < subject->named.block->out_count; i++)
         fprintf(out, "    memset(y%u, 0, %u * sizeof *y%u);\n", (unsigned)i + 1,
-                (unsigned)subject->named.block->out_ports[i].width, (unsigned)i + 1);
+                width_of(&subject->named.block->out_ports[i]), (unsigned)i + 1);
     for (uint32_t i = 0; i < subject->named.type->parameter_count; i++)
         if (is_masked(subject, &subject->named.type->parameters[i]) && is_tunable(&subject->named.type->parameters[i]))
             fprintf(out, "    (void)p%u;\n", place_of(subject, i));

@@ -232,6 +232,11 @@ blocks:
     parameters: {curvatures: [-1, 0, 1], deceleration: 0.5, delay: 0.1, margin: 0.05}
   attitude: {type: angles-to-quaternion, in: {roll: limited.out, pitch: turned.y, yaw: before.out}}
   angles: {type: quaternion-to-angles, in: {quaternion: attitude.quaternion}}
+  command: {type: pack, in: {in0: 7, in1: step.out0}, parameters: {types: [uint32, uint32]}}
+  guard:
+    type: command-guard
+    in: {data: command.out, flag: switch.on, age: 0.01, sequence: step.out0}
+    parameters: {length: 8}
   valves:
     type: thruster-mapping
     in: {force_x: chosen.out, force_y: turned.y, torque: 0.05}
@@ -249,6 +254,7 @@ OBSERVED = (
     "wheels.left,wheels.right,wheels.limited,pose.v,pose.omega,pose.x,pose.y,pose.heading,attitude.quaternion,"
     "driven.v,driven.omega,driven.x,driven.y,driven.heading,driven.lost,range.out,scan.out,clearance.clearance,"
     "clearance.flag,slowed.v,slowed.omega,slowed.limited,slowed.free,"
+    "command.out,guard.data,guard.flag,guard.age,guard.operator,guard.other,guard.conflict,guard.refused,"
     "angles.roll,angles.pitch,angles.yaw,valves.valves,valves.on_time,"
     "valves.achieved,valves.saturated,spots.count,spots.x,spots.y,spots.brightness,spots.flag,spots.sequence"
 )

@@ -79,6 +79,10 @@ ELSEWHERE = {
         "needs the keys of others; runtime/test_update.py signs so",
     ),
     "sudo make fleet-scale N=32": "test_fleet_scale.py runs it for fewer",
+    **dict.fromkeys(
+        ("make station-join", "make station-leave"),
+        "need an adapter; tests/boot/shared/test_radio.py has a simulated one",
+    ),
     "make lock": "asks the mirror for other packages; unit/test_lock.py",
     "make param ROBOT=1 TASK=heading": "needs the robot; test_control_loop.py asks a guest",
     "make param ROBOT=1 TASK=heading PARAM=attitude.kp VALUE=2.5": "needs the robot; test_control_loop.py asks a guest",

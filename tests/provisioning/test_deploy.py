@@ -28,6 +28,7 @@ from lab.emulators.ir104 import Ir104
 from lab.qemu import virtual_fleet
 from lab.qemu.relay_ports import RelayPorts
 from tests.conftest import GuestFactory, RobotGuest
+from tests.fixtures import ert_rates
 from tests.provisioning.test_fleet import ANSIBLE, ENVIRONMENT, REPORTS, RUN_SECONDS, Playbook, altered
 from tests.running import judged_by_outcomes
 
@@ -227,6 +228,32 @@ def test_it_starts_and_stops_by_itself_again_and_again(bench: Bench, kind: str) 
         assert "ActiveState=active" in bench.do(name, "start")
         assert measured(bench.do(name, "stop"))[1] > 0
     assert bench.status(name)["ActiveState"] == "inactive"
+
+
+def test_slower_rates_of_a_model_have_threads_of_lower_priority_on_one_processor(bench: Bench) -> None:
+    """Below the priority of drivers (69), the slower the lower. Seen to fail with `tasking: single`."""
+    shutil.rmtree(bench.apps / "three", ignore_errors=True)
+    ert_rates.write(bench.apps / "three" / "generated")
+    (bench.apps / "three" / "app.yml").write_text("kind: ert\nmodel: three\n")
+    wired = "three: {type: three, in: {fast: 1, middle: 2}}"
+    task = judged_by_outcomes(f"period: 10 ms\npriority: 70\nblocks:\n  {wired}\n")
+    (bench.apps / "three" / "task.yml").write_text(task)
+    bench.place(bench.apps / "three")
+    bench.do("three", "start")
+    pid = bench.guest.shell.run(["systemctl", "show", "-P", "MainPID", "flotilla-app@three"]).stdout.strip()
+    show = f"cd /proc/{pid}/task; for each in *; do cat $each/stat; grep Cpus_allowed_list $each/status; done"
+    lines = bench.guest.shell.run(["sudo", "sh", "-c", show]).stdout.splitlines()
+    found = {}
+    for stat, processors in zip(lines[::2], lines[1::2], strict=True):
+        after = stat.rpartition(") ")[2].split()
+        found[stat.partition("(")[2].rpartition(") ")[0]] = (int(after[37]), int(after[38]), processors.split()[-1])
+    assert found["task"][:2] == (70, 1)
+    assert found["three_step1"] == (68, 1, found["task"][2])
+    assert found["three_step2"] == (67, 1, found["task"][2])
+    assert found["task"][2].isdigit(), "its threads may go to several processors"
+    assert measured(bench.do("three", "stop"))[1] > 0
+    rates = json.loads((paths.BUILD / "reports" / f"app-{bench.guest.robot.name}-three.json").read_text())
+    assert [rate["count"] > 0 for rate in rates["blocks"]["three"]["rates"]] == [True, True]
 
 
 def test_a_program_that_ignores_sigterm_is_ended_and_its_relays_are_reset(bench: Bench) -> None:

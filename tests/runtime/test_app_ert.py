@@ -167,10 +167,12 @@ def test_files_that_are_missing(generated: Path, tmp_path: Path) -> None:
         ert.block(generated.parent, "other", "sample", [], tmp_path / "out", "amd64")
 
 
-def run(flotilla_run: Path, generated: Path, task: str, steps: int, watch: str) -> list[dict[str, float]]:
+def run(
+    flotilla_run: Path, generated: Path, task: str, steps: int, watch: str, tasking: str | None = None
+) -> list[dict[str, float]]:
     """The values of signals in each step of a task that uses the block `sample`."""
     out = generated.parent / "source"
-    ert.block(generated.parent, "sample", "sample", [], out, "amd64")
+    ert.block(generated.parent, "sample", "sample", [], out, "amd64", tasking)
     (generated.parent / "blocks").mkdir()
     warnings = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-O2"]
     argv = ["cc", *warnings, "-shared", "-fPIC", f"-I{paths.PROJECT / 'runtime' / 'include'}", "-o"]
@@ -199,12 +201,12 @@ blocks:
 
 
 def controller(errors: list[float], kp: float, ki: float, limit: float, weighted: float) -> list[float]:
-    """What the sample's header says its model does."""
-    commands, integral = [], 0.0
+    """What the sample's header says its model does: the fast rate sees the integral one slow period later."""
+    commands, integral, handed = [], 0.0, 0.0
     for step, error in enumerate(errors):
-        commands.append(kp * error - weighted + integral)
         if step % 5 == 0:
-            integral = max(-limit, min(limit, integral + 0.05 * ki * error))
+            handed, integral = integral, max(-limit, min(limit, integral + 0.05 * ki * error))
+        commands.append(kp * error - weighted + handed)
     return commands
 
 
@@ -217,6 +219,13 @@ def test_the_block_does_what_the_model_does_twice_in_a_task(flotilla_run: Path, 
     tuned = controller(errors, 1, 100, 0.03, 2)
     assert [row["plain.command"] for row in rows] == pytest.approx(plain)
     assert [row["tuned.command"] for row in rows] == pytest.approx(tuned)
+    assert [row["plain.updates"] for row in rows] == [step // 5 for step in range(23)], "not those of the last release"
+
+
+def test_in_one_thread_the_outputs_are_those_of_the_step(flotilla_run: Path, generated: Path) -> None:
+    rows = run(flotilla_run, generated, TASK, 23, "ramp.out,plain.command,plain.updates", "single")
+    expected = controller([row["ramp.out"] for row in rows], 2.5, 0.5, 10, 0.25 * 1 - 0.25 * 2)
+    assert [row["plain.command"] for row in rows] == pytest.approx(expected)
     assert [row["plain.updates"] for row in rows] == [1 + step // 5 for step in range(23)]
 
 

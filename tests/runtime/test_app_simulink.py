@@ -1,7 +1,8 @@
 """Blocks of the runtime in a Simulink model: what `flotilla-blocks --legacy-code` writes, called as by generated code.
 
-There is no MATLAB here: the script is held against what its manual says of function specifications, the C files are
-compiled as for a simulation and as for a robot, and run with a model whose code is written as Embedded Coder writes it.
+There is no MATLAB here: the script is held against what its manual says of function specifications (test_matlab.py runs
+it), the C files are compiled as for a simulation and as for a robot, and run with a model whose code is written as
+Embedded Coder writes it.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def specifications(out: Path, function: str) -> list[str]:
 def test_every_block_that_can_is_written_and_compiles_for_both(flotilla_run: Path, tmp_path: Path) -> None:
     done = legacy_code(flotilla_run, tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "\nclock: left out: its port step is of uint64" in done.stderr
+    assert "clock: left out" not in done.stderr
     steps = specifications(tmp_path, "Output")
     assert len(steps) > 10
     for specification in [*specifications(tmp_path, "Start"), *steps, *specifications(tmp_path, "Terminate")]:
@@ -106,7 +107,6 @@ int main(void)
     ("words", "said"),
     [
         (["gian"], "there is no block gian; the nearest is gain"),
-        (["clock"], "clock: its port step is of uint64"),
         (["pid", "kq=1"], "pid: parameters: block pid: pid has no parameter kq; it has kp"),
         (["constant"], "constant: value is an empty list; write PARAMETER=VALUE behind the block"),
         (["udp-receive"], "udp-receive: parameter port cannot be left to Simulink; write port=VALUE behind the block"),

@@ -214,6 +214,7 @@ def test_without_reports_it_rests(fleet: Path, robot: Robot, tmp_path: Path) -> 
         terminal.until("no report yet, so nothing is sent")
         assert robot.commands == []
         robot.silent = False
+        robot.does(0, enable=False)
         terminal.press("e")
         robot.does(0)
         robot.does(0.25, hold=terminal.hold("w"))

@@ -205,13 +205,15 @@ TIMES = {"count": 100, "min_ns": 1000, "mean_ns": 2500, "p99_ns": 80000, "max_ns
 
 def test_the_report() -> None:
     counted = {"period_ns": 10_000_000, "steps": 100, "overruns": 2, "skipped": 3}
-    block = {"count": 100, "mean_ns": 2500, "max_ns": 91250}
+    rate = {"name": "hover_step1", "every": 5, "count": 20, "overruns": 1, "mean_ns": 30000, "max_ns": 31000}
+    block = {"count": 100, "mean_ns": 2500, "max_ns": 91250, "rates": [rate]}
     lines = remote.summary({**counted, "jitter": TIMES, "step": TIMES, "blocks": {"a": block}})
     assert lines == [
         "period 10 ms, 100 steps, 2 overruns, 3 skipped",
         "jitter: mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
         "step:   mean 2.5 µs, 99 % 80.0 µs, max 91.2 µs",
         "  a: mean 2.5 µs, max 91.2 µs",
+        "    hover_step1, every 5 steps: mean 30.0 µs, max 31.0 µs, 1 overruns",
     ]
 
 

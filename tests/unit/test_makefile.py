@@ -35,6 +35,7 @@ GIVEN = {
     "releases": ["ROBOT"],
     "cve": ["TRACKER"],
     "bench": ["ROBOT"],
+    "station": ["PORT", "ADDRESS", "OUT", "REPLAY", "INVENTORY", "SECONDS"],
     "record": ["PORT", "SECONDS", "ADDRESS"],
     "live": ["OUT", "SECONDS"],
     "top": ["OUT", "PORT"],

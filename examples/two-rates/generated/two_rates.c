@@ -21,13 +21,16 @@ void two_rates_step0(RT_MODEL_two_rates_T *const two_rates_M, ExtU_two_rates_T *
     /* RateTransition: '<Root>/Rate Transition' */
     if (two_rates_M->Timing.TaskCounters.TID[1] == 0) {
         two_rates_DW->RateTransition_Buffer = two_rates_U->error;
+
+        /* RateTransition: '<Root>/Rate Transition1' */
+        two_rates_DW->RateTransition1 = two_rates_DW->RateTransition1_Buffer0;
     }
 
     /* Outport: '<Root>/command' */
     if (two_rates_U->enable) {
         two_rates_Y->command = two_rates_P->Kp * two_rates_U->error - (two_rates_P->Weights[0] *
             two_rates_U->rates[0] + two_rates_P->Weights[1] * two_rates_U->rates[1]) +
-            two_rates_DW->RateTransition1_Buffer;
+            two_rates_DW->RateTransition1;
     } else {
         two_rates_Y->command = 0.0;
     }
@@ -53,7 +56,7 @@ void two_rates_step1(RT_MODEL_two_rates_T *const two_rates_M, ExtY_two_rates_T *
     }
 
     /* RateTransition: '<Root>/Rate Transition1' */
-    two_rates_DW->RateTransition1_Buffer = two_rates_DW->Integrator_DSTATE;
+    two_rates_DW->RateTransition1_Buffer0 = two_rates_DW->Integrator_DSTATE;
 
     /* Outport: '<Root>/updates' */
     two_rates_Y->updates++;

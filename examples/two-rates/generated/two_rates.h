@@ -2,6 +2,8 @@
  *
  *   command = Kp * error - Weights * rates + integral      each 10 ms
  *   integral += Ki * error * 50 ms, within +-Limit         each 50 ms
+ *
+ * Rate transitions ensure data integrity and determinism: the integral is that of the last 50 ms.
  */
 #ifndef TWO_RATES_H
 #define TWO_RATES_H
@@ -18,9 +20,10 @@
 
 /* Block states (default storage) for system '<Root>' */
 typedef struct {
-    real_T RateTransition_Buffer;  /* '<Root>/Rate Transition' */
-    real_T RateTransition1_Buffer; /* '<Root>/Rate Transition1' */
-    real_T Integrator_DSTATE;      /* '<Root>/Integrator' */
+    real_T RateTransition_Buffer;   /* '<Root>/Rate Transition' */
+    real_T RateTransition1_Buffer0; /* '<Root>/Rate Transition1' */
+    real_T RateTransition1;         /* '<Root>/Rate Transition1' */
+    real_T Integrator_DSTATE;       /* '<Root>/Integrator' */
 } DW_two_rates_T;
 
 /* External inputs (root inport signals with default storage) */

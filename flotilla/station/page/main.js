@@ -1,0 +1,97 @@
+// Puts the page together: each part gets the greeting after a connection (`begin`) and the state ten times a second.
+
+import { Connection } from "./connection.js";
+import { $, make, number, text, toast } from "./dom.js";
+import { Drive } from "./drive.js";
+import { Fleet } from "./fleet.js";
+import { Map2d } from "./map.js";
+import { Plots } from "./plots.js";
+import { Tasks } from "./tasks.js";
+
+if (location.search) history.replaceState(null, "", location.pathname); // the token is in a cookie now
+
+const connection = new Connection((open, reason) => {
+  text($("link"), open ? "connected" : "not connected");
+  $("link").className = `pill ${open ? "good" : "bad"}`;
+  if (!open) {
+    drive.rest();
+    if (reason) toast(`The station closed the connection: ${reason}`);
+  }
+});
+const fleet = new Fleet((robot) => {
+  drive?.choose(robot);
+  tasks?.choose(robot);
+});
+const map = new Map2d(fleet);
+const drive = new Drive(connection, fleet);
+const tasks = new Tasks(connection, fleet);
+const plots = new Plots(connection, fleet);
+const notes = $("notes").querySelector("ol");
+
+function note({ at, text: words }) {
+  notes.prepend(make("li", {}, make("time", {}, new Date(at * 1000).toLocaleTimeString("en-GB")), make("span", {}, words)));
+  while (notes.children.length > 100) notes.lastChild.remove();
+}
+
+connection.on("hello", (hello) => {
+  text($("fleet-name"), hello.fleet);
+  document.title = `${hello.replay ? hello.replay.file : hello.fleet} · Flotilla`;
+  notes.replaceChildren();
+  hello.notes.forEach(note);
+  fleet.begin(hello);
+  map.begin(hello.paths);
+  drive.begin(hello);
+  tasks.begin(hello);
+  plots.begin(hello);
+  $("drive").hidden = Boolean(hello.replay);
+  $("record").hidden = $("stop-all").hidden = Boolean(hello.replay);
+  $("replay").hidden = !hello.replay;
+  document.body.classList.toggle("replays", Boolean(hello.replay));
+  if (hello.replay) {
+    $("position").max = hello.replay.s;
+    text($("replay-file"), hello.replay.file);
+  }
+});
+connection.on("begin", ({ paths }) => {
+  map.begin(paths);
+  plots.jump();
+});
+connection.on("note", note);
+connection.on("scans", ({ scans }) => map.scan(scans));
+connection.on("state", (state) => {
+  fleet.show(state);
+  map.show(state, fleet.free(state));
+  drive.show(state);
+  tasks.show(state);
+  text($("browsers"), state.browsers > 1 ? `${state.browsers} browsers` : "");
+  const recording = state.recording;
+  $("record").classList.toggle("on", Boolean(recording));
+  $("record").lastElementChild.textContent = recording ? `Recording ${Math.floor(recording.s)} s · ${recording.messages}` : "Record";
+  $("record").title = recording?.file ?? "Record what all robots report";
+  if (state.replay) showReplay(state.replay);
+});
+
+$("record").onclick = () => {
+  const on = !$("record").classList.contains("on");
+  connection.ask({ do: "record", on }).catch((error) => toast(error.message));
+};
+$("stop-all").onclick = () => {
+  drive.rest();
+  if (!connection.send({ do: "stop-all" })) toast("No connection to the station: nothing was stopped.");
+};
+
+let seeking = false;
+function showReplay({ s, playing, speed }) {
+  text($("play"), playing ? "Pause" : "Play");
+  $("play").dataset.playing = playing;
+  if (!seeking) $("position").value = s;
+  text($("position-s"), `${number(s, 1)} of ${number(+$("position").max, 1)} s`);
+  if (document.activeElement !== $("speed")) $("speed").value = speed;
+}
+$("play").onclick = () => connection.send({ do: "play", on: $("play").dataset.playing !== "true" });
+$("position").oninput = () => (seeking = true);
+$("position").onchange = () => {
+  seeking = false;
+  connection.send({ do: "play", at_s: +$("position").value });
+};
+$("speed").onchange = () => connection.send({ do: "play", speed: +$("speed").value });

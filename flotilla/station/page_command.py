@@ -1,0 +1,124 @@
+"""The station's page: `make station`."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from ipaddress import ip_address
+from pathlib import Path
+
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
+from flotilla.fleet.model import Fleet
+from flotilla.station.desk import Desk
+from flotilla.station.driving import Driving
+from flotilla.station.receiver import REFRESH_S, Receiver, drain, listen
+from flotilla.station.replay import Replay
+from flotilla.station.services import Services, State
+from flotilla.station.telemetry import streams
+from flotilla.station.view import View
+from flotilla.station.web import Web
+
+PORT = 8080
+STATE_S = 0.1
+"""From one state that browsers get to the next."""
+
+
+def run(arguments: argparse.Namespace) -> None:
+    fleet = inventory.load_fleet(arguments.inventory)
+    address = _address(arguments.page_address)
+    known = streams(fleet)
+    replay = Replay(arguments.replay, known) if arguments.replay else None
+    receiver = Receiver(replay.streams if replay else known)
+    with Driving(fleet, arguments.address) as driving:
+        asyncio.run(_serve(arguments, fleet, receiver, replay, driving, address))
+
+
+async def _serve(
+    arguments: argparse.Namespace,
+    fleet: Fleet,
+    receiver: Receiver,
+    replay: Replay | None,
+    driving: Driving,
+    address: str,
+) -> None:
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    view = View(receiver, replay.clock if replay else time.time_ns)
+    receiver.sinks.append(view)
+    states, trouble = ({}, "") if replay else _states(fleet)
+    desk = Desk(fleet, receiver, view, states, replay, driving)
+    receiver.sinks.append(desk.recording)
+    sockets = [] if replay else listen((stream.port for stream in receiver.known.values()), arguments.address)
+    for one in sockets:
+        loop.add_reader(one, drain, one, receiver)
+    if arguments.record:
+        desk.recording.begin(arguments.record)
+    web = Web(desk, address, arguments.port)
+    url = await web.begin()
+    try:
+        sys.stderr.write(f"the station's page: {url}\n")
+        sys.stderr.flush()
+        if trouble:
+            desk.note(trouble)
+        if replay:
+            replay.play(True)
+        await _until(ended, arguments.seconds, desk, receiver, replay)
+    finally:
+        for one in sockets:
+            loop.remove_reader(one)
+        await desk.end()
+        await web.end()
+    if not replay:
+        print("\n".join(receiver.summary))
+
+
+async def _until(
+    ended: asyncio.Event, seconds: float | None, desk: Desk, receiver: Receiver, replay: Replay | None
+) -> None:
+    """Show the state ten times a second until then, or for so long."""
+    loop = asyncio.get_running_loop()
+    end = loop.time() + (seconds if seconds is not None else float("inf"))
+    refreshed = loop.time()
+    while not ended.is_set() and loop.time() < end:
+        if replay:
+            replay.advance(receiver)
+        desk.show()
+        if loop.time() - refreshed >= REFRESH_S:
+            refreshed = loop.time()
+            receiver.refresh()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(ended.wait(), STATE_S)
+
+
+def _states(fleet: Fleet) -> tuple[Mapping[tuple[str, str], State], str]:
+    """Of tasks, asked by ssh, and why they are not asked, if they are not."""
+    try:
+        return Services(fleet.robots.values()).states, ""
+    except UserError as error:
+        return {}, f"tasks are not asked: {error}"
+
+
+def _address(text: str) -> str:
+    try:
+        return str(ip_address(text))
+    except ValueError as error:
+        raise UserError(f"ADDRESS={text}: is no address of this computer; such as 127.0.0.1") from error
+
+
+def page_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--port", type=int, default=PORT, help="TCP port of the page (%(default)s)")
+    parser.add_argument("--page-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="show a recording instead of robots")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="record from the start")
+    parser.add_argument("--seconds", type=float, help="end after so many")
+    parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
+    parser.add_argument("--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)")

@@ -1,0 +1,1 @@
+"""A release that comes to a robot while its control runs."""
