@@ -425,7 +425,7 @@ def test_robots_that_do_not_see_each_other_collide(drive: Drive, tmp_path: Path)
 
 
 def test_plants_of_two_computers_tell_each_other_where_they_are(command: list[str | Path], tmp_path: Path) -> None:
-    """Each as its guest gets it, but for drives and scanner. Seen to fail with a wrong port."""
+    """Each as its guest gets it, but for drives and scanner. Seen to fail where one listens at another port."""
     ports = dict(zip((1, 2), free_udp_ports(2), strict=True))
     with contextlib.ExitStack() as stack:
         seen = []
