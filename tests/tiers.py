@@ -33,6 +33,7 @@ LONGEST = (
     "test_build.py",
     "test_control_loop.py",
     "test_blocks_guest.py",
+    "test_wheeled_live.py",
     "test_wheeled_virtual.py",
     "test_virtual_loop.py",
     "test_boot_time.py",

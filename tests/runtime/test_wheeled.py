@@ -5,6 +5,7 @@ By a clock that counts, so every figure repeats on every computer, but for round
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import random
@@ -18,10 +19,14 @@ import yaml
 
 from flotilla.common.errors import UserError
 from lab.plants import wheeled
+from lab.qemu.segment import free_udp_ports
+from lab.qemu.timing import Deadline
 from lab.wheeled import by_wires
+from lab.wheeled import plant as plant_task
 from lab.wheeled.by_wires import Command, Course, Row
 from lab.wheeled.guest import COMMAND
-from lab.wheeled.plant import Trouble
+from lab.wheeled.plant import Plant as PlantTask
+from lab.wheeled.plant import Room, Trouble
 from tests.running import PATIENCE
 from tests.runtime import test_plant_blocks
 
@@ -384,7 +389,7 @@ def test_no_wheel_drives_alone(drive: Drive, side: str) -> None:
     assert rows[-1]["motion"][0] > 0.4
 
 
-TOWARDS = [{"initial_pose": [0, 0.0, 0]}, {"initial_pose": [3.5, 0.05, math.pi]}]
+TOWARDS: list[dict[str, Any]] = [{"initial_pose": [0, 0.0, 0]}, {"initial_pose": [3.5, 0.05, math.pi]}]
 """Two robots that look at each other."""
 
 
@@ -417,6 +422,38 @@ def test_robots_that_do_not_see_each_other_collide(drive: Drive, tmp_path: Path)
     """So the ones above would."""
     rows = drive(Course(12, [*BY_HAND, Command(1, 0.5)], figures=TOWARDS[0]))
     assert max(row["pose"][0] for row in rows) > 3.5 - 2 * FIGURES["body_radius"]
+
+
+def test_plants_of_two_computers_tell_each_other_where_they_are(command: list[str | Path], tmp_path: Path) -> None:
+    """Each as its guest gets it, but for drives and scanner. Seen to fail where one listens at another port."""
+    ports = dict(zip((1, 2), free_udp_ports(2), strict=True))
+    with contextlib.ExitStack() as stack:
+        seen = []
+        for number, other in ((1, 2), (2, 1)):
+            task = plant_task.task(
+                PlantTask(figures=TOWARDS[number - 1] | {"range_noise": 0, "range_noise_relative": 0}), "", "",
+                station="127.0.0.1", room=Room(number, {other: "127.0.0.1"}),
+            )  # fmt: skip
+            blocks = task["blocks"]
+            for name in ("drives", "scanner", "truth", "to_station"):
+                del blocks[name]
+            blocks["robot"]["in"] |= {"target": "robot.speed", "enable": "robot.enabled"}
+            del blocks["robot"]["in"]["mode"]
+            blocks["to_others"]["parameters"]["port"] = ports[number]
+            blocks[f"other{other}"]["parameters"]["port"] = ports[other]
+            file = tmp_path / f"plant{number}.yml"
+            file.write_text(yaml.safe_dump(task | {"priority": 0}))
+            argv = [*command, "--watch", "robot.millimetres", file]
+            seen.append(stack.enter_context(subprocess.Popen(argv, stdout=subprocess.PIPE, text=True)))
+            stack.callback(seen[-1].kill)
+        between = math.dist(*(figures["initial_pose"][:2] for figures in TOWARDS))
+        expected = 1e3 * (between - FIGURES["scanner_x"] - FIGURES["body_radius"])
+        limit = Deadline(PATIENCE)
+        for one in seen:
+            assert one.stdout
+            ahead = (json.loads(line)["robot.millimetres"][384 - 44] for line in one.stdout)
+            assert any(range_mm == pytest.approx(expected, abs=10) or limit.expired for range_mm in ahead)
+            assert not limit.expired, "it does not see the other"
 
 
 def test_a_drive_repeats(drive: Drive) -> None:
