@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flotilla.common import progress
+from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Board, Releases
