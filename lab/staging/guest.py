@@ -97,12 +97,12 @@ def card(name: str, session: dict[str, Any], above: int) -> str:
 class Task:
     """The control task, and what it says of itself."""
 
-    def __init__(self, session: dict[str, Any], out: Path, library: str = "") -> None:
+    def __init__(self, session: dict[str, Any], out: Path, file: str, library: str = "") -> None:
         """`library`: what it loads before all others."""
         self.out = out
         out.mkdir()
         argv = ["flotilla-run", "--blocks", session["blocks"], "--statistics", str(out / "statistics.json")]
-        argv += ["--control", str(out / "control"), session["task"]]
+        argv += ["--control", str(out / "control"), file]
         with (out / "log").open("wb") as log:
             environment = os.environ | ({"LD_PRELOAD": library} if library else {})
             self._process = subprocess.Popen(argv, stdout=log, stderr=log, cwd=out, env=environment)
@@ -142,7 +142,7 @@ def course(name: str, session: dict[str, Any], above: dict[str, int], out: Path)
     receiver_above(above["receiver"])
     device = card(name, session, above["updater"])
     update = str(UPDATER / "update.py")
-    task = Task(session, out / name)
+    task = Task(session, out / name, session["task"])
     time.sleep(session["alone_s"])
     told: dict[str, Any] = {"alone": task.now()}
     told["begin"] = json.loads(run(update, "begin", given=Path(session["offer"]).read_bytes()))
@@ -167,9 +167,9 @@ def course(name: str, session: dict[str, Any], above: dict[str, int], out: Path)
     return told
 
 
-def alone(session: dict[str, Any], out: Path, library: str = "") -> dict[str, Any]:
-    """The task, and no update."""
-    task = Task(session, out, library)
+def alone(session: dict[str, Any], out: Path, file: str, library: str = "") -> dict[str, Any]:
+    """A task, and no update."""
+    task = Task(session, out, file, library)
     time.sleep(session["alone_s"])
     before = task.now()
     time.sleep(session["without_s"])
@@ -182,8 +182,8 @@ def main(session: dict[str, Any], out: Path) -> dict[str, Any]:
     try:
         cell(session["robot"], session["station"], session["prefix"])
         data(session["data_mib"])
-        said["alone"] = alone(session, out / "alone")
-        said["bad"] = alone(session, out / "bad", session["overrun"])
+        said["alone"] = alone(session, out / "alone", session["task"])
+        said["bad"] = alone(session, out / "bad", session["heartbeat"], session["overrun"])
         for name, above in session["courses"].items():
             said[name] = course(name, session, above, out)
     except Exception:

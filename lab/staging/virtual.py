@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flotilla.common import progress
+from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Board, Releases
@@ -31,6 +31,8 @@ from lab.latency.virtual_loop import CHAIN, PLUGIN
 HERE = Path(__file__).parent
 OVERRUN = HERE / "overrun.c"
 DIRECTORY = subject.DIRECTORY
+OVERRUN_THERE = f"{DIRECTORY}/library/overrun.so"
+"""Not beside the plug-ins."""
 ROBOT, STATION, PREFIX = "10.43.0.1", "10.43.0.100", 24
 """A network of its own: the wire of the guest leads nowhere."""
 SEED = 1
@@ -50,7 +52,7 @@ DATA_MIB = 96
 MEMORY_MIB = 512
 """Of the guest, which has its card in memory."""
 ALONE, BAD = "alone", "bad"
-"""The task without an update, and with the library by which tasks of a bad release overrun."""
+"""The task without an update; the heartbeat with the library by which tasks of a bad release overrun."""
 SHIPPED, RECEIVER, UPDATER = "shipped", "receiver", "updater"
 ABOVE = 90
 """A real-time priority; the task has 80."""
@@ -205,12 +207,13 @@ def stage(board: Board, kbit_s: int, out: Path) -> Staged:
     session = brought.session | {
         "robot": ROBOT, "station": STATION, "prefix": PREFIX, "bit_s": 1000 * kbit_s, "data_mib": DATA_MIB,
         "blocks": str(DIRECTORY), "task": f"{DIRECTORY}/task.yml", "alone_s": ALONE_S, "without_s": WITHOUT_S,
-        "courses": COURSES, "overrun": f"{DIRECTORY}/overrun.so",
+        "courses": COURSES, "heartbeat": f"{DIRECTORY}/heartbeat.yml", "overrun": OVERRUN_THERE,
     }  # fmt: skip
     files = brought.files | {
         f"{DIRECTORY}/task.yml": CHAIN.format(device=f"/dev/{board.ports[port].tty}").encode(),
         f"{DIRECTORY}/loopback.so": runtime.compile_plugin(PLUGIN, board.architecture),
-        f"{DIRECTORY}/overrun.so": runtime.compile_plugin(OVERRUN, board.architecture),
+        f"{DIRECTORY}/heartbeat.yml": (paths.TASKS / "heartbeat.yml").read_bytes(),
+        OVERRUN_THERE: runtime.compile_plugin(OVERRUN, board.architecture),
         f"{DIRECTORY}/guest.py": (HERE / "guest.py").read_bytes(),
         f"{DIRECTORY}/session.json": json.dumps(session).encode(),
     }

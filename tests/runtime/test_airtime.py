@@ -209,8 +209,7 @@ def test_eight_robots_get_a_release_for_a_quarter_more_than_its_bytes(cell: Cell
 
 
 def test_a_robot_that_hears_no_multicast_gets_a_copy_by_ssh(cell: Cell) -> None:
-    """The others have it from the air, and it costs them nothing. Seen to fail where `release` trusts that who was to
-    listen has the file, and where the copy by SSH is left out."""
+    """The others have it from the air, and it costs them nothing. Seen to fail where the copy by SSH is left out."""
     bundle = cell.release(8)
     *_, last = cell.robots
     cell.radio.deaf.add(cell.robots[last].name)
