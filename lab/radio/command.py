@@ -28,7 +28,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", help="until when a chain's last hop has to be there, in ms; by default its period")
     parser.add_argument("--missed", default="1", help="steps that may be late or lost, in percent")
     parser.add_argument("--compute", default="400", help="of each hop, what the computer takes, in µs")
-    parser.add_argument("--seconds", default="4", help="simulated, of the fleet as it is")
+    parser.add_argument("--seconds", default="6", help="simulated, of the fleet as it is")
     parser.add_argument("--seed", default="1", help="of all chance")
 
 
