@@ -20,7 +20,7 @@ ROWS_HZ = 100
 _BATCH_S = 0.1
 _BATCH_ROWS = 2000
 _LINE_BYTES = 65536
-_SETTINGS = ("-o", "ConnectTimeout=10", "-o", "ServerAliveInterval=5", "-o", "ServerAliveCountMax=2")
+_SETTINGS = ("-o", "ServerAliveInterval=10", "-o", "ServerAliveCountMax=3")
 _UNTIL_STDIN_ENDS = (
     "exec 3<&0; {command} & task=$!; {{ cat <&3; kill $task; }} >/dev/null 2>&1 & cat=$!; "
     "wait $task; status=$?; kill $cat 2>/dev/null; exit $status"

@@ -145,8 +145,7 @@ def driver(page: Page, robot: WheeledRobot) -> Page:
 
 
 def test_the_fleet_is_shown(page: Page, served: Station, robot: WheeledRobot, artefacts: Path) -> None:
-    """With a link and tasks that run, at each width, from this program alone. Seen to fail with a robot that sends
-    datagrams of another length, and with a column of 2000 px."""
+    """With a link and tasks that run, at each width, from this program alone. Seen to fail with a column of 2000 px."""
     page.until("document.querySelector('.robot .pill').textContent.startsWith('link ')")
     page.until("document.querySelector('#tasks .pill').textContent.startsWith('running')")
     assert "rover" in page.text("#fleet")
@@ -172,7 +171,7 @@ def test_keys_drive_the_robot(
     driver: Page, robot: WheeledRobot, record_property: Callable[[str, object], None]
 ) -> None:
     """Ahead and to the left while keys are held, at rest when they are let go. How long a key takes to the wire is
-    printed. Seen to fail without the handler of keyup, and with signs of the turn exchanged."""
+    printed. Seen to fail with signs of the turn exchanged."""
     before = robot.pose[0]
     driver.key("ArrowUp", True)
     until(lambda: robot.pose[0] > before + 0.05, "it goes ahead")
@@ -197,7 +196,6 @@ def test_keys_drive_the_robot(
 
 
 def test_the_stick_drives_the_robot(driver: Page, robot: WheeledRobot, artefacts: Path) -> None:
-    """Seen to fail where the stick's end is not noticed."""
     x, y = driver.middle("#stick")
     driver.mouse("mousePressed", x, y)
     driver.mouse("mouseMoved", x + 10, y - 50)
@@ -211,8 +209,8 @@ def test_the_stick_drives_the_robot(driver: Page, robot: WheeledRobot, artefacts
     "how", ["window.dispatchEvent(new Event('blur'))", "document.activeElement.blur(), location.reload()"]
 )
 def test_focus_elsewhere_ends_the_input(driver: Page, robot: WheeledRobot, how: str) -> None:
-    """A key is held, and nobody says that it was let go. Seen to fail without the handlers of blur and, on the station,
-    of a socket that is gone."""
+    """A key is held, and nobody says that it was let go. Seen to fail, for blur,
+    without its handler."""
     driver.key("ArrowUp", True)
     until(lambda: robot.moves, "it goes")
     driver.value(how)
@@ -223,7 +221,7 @@ def test_focus_elsewhere_ends_the_input(driver: Page, robot: WheeledRobot, how: 
 
 
 def test_a_browser_that_is_closed_lets_go(driver: Page, browser: Browser, served: Station, robot: WheeledRobot) -> None:
-    """While a key is held. Seen to fail where the station keeps the hold of a browser that is gone."""
+    """While a key is held."""
     driver.key("ArrowUp", True)
     until(lambda: robot.moves, "it goes")
     other = connected(browser.page(), served.url)
@@ -358,8 +356,7 @@ def rested(robot: WheeledRobot) -> None:
     ],
 )  # fmt: skip
 def test_garbage_is_named_and_ended(served: Station, driver: Page, robot: WheeledRobot, garbage: str | bytes) -> None:
-    """Twenty times, while somebody else drives, who does not notice. Seen to fail with a model that permits what is not
-    finite, and without the count."""
+    """Twenty times, while somebody else drives, who does not notice."""
     driver.key("ArrowUp", True)
     until(lambda: robot.moves, "it goes")
     client = served.client()
@@ -376,7 +373,7 @@ def test_ten_thousand_commands_a_second(
     served: Station, browser: Browser, robot: WheeledRobot, record_property: Callable[[str, object], None]
 ) -> None:
     """From whoever holds the robot: its datagrams stay ten a second, the flood is named and ended, the robot stops, and
-    somebody else can take it. Seen to fail without a limit, where the connection lasts."""
+    somebody else can take it."""
     client = served.client()
     you = client.until(lambda message: message["type"] == "hello")["you"]
     client.send(do="take", robot="rover")
@@ -413,7 +410,7 @@ def status(served: Station, path: str, **headers: str) -> int:
 
 
 def test_only_who_has_the_token_is_answered(served: Station) -> None:
-    """Each was seen to fail with its check left out of access.py."""
+    """By token, Host and Origin."""
     token, port = served.token, served.host.rpartition(":")[2]
     assert status(served, f"/?token={token}") == 200
     assert status(served, "/") == 403
@@ -435,8 +432,7 @@ def test_only_who_has_the_token_is_answered(served: Station) -> None:
 def test_a_recording_is_made_and_replayed(
     page: Page, browser: Browser, served: Station, fleet: Path, environment: dict[str, str], artefacts: Path
 ) -> None:
-    """By the page, with the same page: it plays, jumps and ends. Seen to fail with a replay that begins anew at each
-    jump."""
+    """By the page, with the same page: it plays, jumps and ends."""
     page.click("#record")
     page.until("/^Recording \\d+ s · [2-9]\\d/.test(document.querySelector('#record span').textContent)")
     page.click("#record")
@@ -463,7 +459,7 @@ def test_a_recording_is_made_and_replayed(
 
 
 def test_a_browser_that_does_not_read_disturbs_nobody(served: Station, page: Page) -> None:
-    """It is gone after a while, and the page goes on meanwhile. Seen to fail without the station's heartbeat."""
+    """It is gone after a while, and the page goes on meanwhile."""
     host, _, port = served.host.rpartition(":")
     with socket.create_connection((host, int(port)), PATIENCE) as slow:
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -26,7 +26,6 @@ DRIVE = {"do": "drive", "robot": "rover", "v": 0.5, "omega": 0, "boom": 0.1, "en
 
 
 def test_what_others_made_is_as_they_published_it() -> None:
-    """Seen to fail with a blank more in a file."""
     table = (PAGE / "vendor" / "README.md").read_text()
     listed = dict(re.findall(r"^\| `(\S+)` \|.* `([0-9a-f]{64})` \|$", table, re.M))
     assert set(listed) == {"uPlot.esm.js", "uPlot.min.css"}
@@ -35,8 +34,7 @@ def test_what_others_made_is_as_they_published_it() -> None:
 
 
 def test_the_page_needs_nothing_from_elsewhere() -> None:
-    """No address of another computer stands in it, and nothing that the policy would refuse. Seen to fail with a font
-    from elsewhere, and with a script in the page."""
+    """No address of another computer stands in it, and nothing that the policy would refuse."""
     for file in PAGE.glob("*.*"):
         text = file.read_text()
         assert not re.findall(r"https?://(?!www\.w3\.org/2000/svg)|//cdn", text), file
@@ -63,7 +61,6 @@ def test_a_request_that_is_one() -> None:
     ],
 )  # fmt: skip
 def test_a_request_that_is_none(wrong: dict[str, object]) -> None:
-    """Seen to fail without limits, strictness and patterns."""
     kept = DRIVE if wrong.get("do", "drive") not in ("set", "watch") else {"robot": "rover"}
     with pytest.raises(NoRequestError):
         page_requests.read(json.dumps(kept | wrong))
@@ -85,7 +82,7 @@ def test_no_json_of_a_request(text: str | bytes) -> None:
     ],
 )  # fmt: skip
 def test_addresses_that_are_this_page(address: str, host: str, good: bool) -> None:
-    """A name that somebody makes lead here is none. Seen to fail where any Host is taken."""
+    """A name that somebody makes lead here is none."""
     access = Access(address, 8080)
     token = access.url.rpartition("=")[2]
     headers = {"Host": f"{host}:8080", "Origin": f"http://{host}:8080"}
@@ -103,8 +100,7 @@ def test_rows_come_no_faster_than_a_screen_shows() -> None:
 
 
 def test_a_pose_a_path_and_a_scan() -> None:
-    """Points are in the robot's axes: straight ahead, 1 m before a scanner that is 0.15 m ahead. Seen to fail with a
-    scanner in the robot's middle."""
+    """Points are in the robot's axes: straight ahead, 1 m before a scanner that is 0.15 m ahead."""
     known = {stream.task: stream for stream in streams(by_wires.fleet())}
     receiver = Receiver(known.values())
     view = View(receiver, lambda: 10**9)
