@@ -122,4 +122,7 @@ double wheeled_cast(const struct wheeled *robot, double bearing);
 /* A scan in mm as a URG-04LX tells it, with noise: 0 where nothing is measured. */
 void wheeled_scan(struct wheeled *robot, uint16_t millimetres[WHEELED_STEPS]);
 
+/* The same of some steps, from `first` up to but not with `end`, where the robot is now: a scanner turns. */
+void wheeled_scan_part(struct wheeled *robot, int first, int end, uint16_t millimetres[WHEELED_STEPS]);
+
 #endif

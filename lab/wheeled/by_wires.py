@@ -78,7 +78,8 @@ def task(course: Course, described: Fleet) -> dict[str, Any]:
                 continue
             if slower > 1:
                 told["every"] = slower
-            told["in"] = {port: _wire(wires[name], name, wire) for port, wire in told.get("in", {}).items()}
+            ends = {port: _wire(wires[name], name, wire) for port, wire in told.get("in", {}).items()}
+            told["in"] = {port: end for port, end in ends.items() if end is not None}
             blocks[f"{name}_{block}"] = told
     for key, value in course.changes.items():
         block, parameter = key.split(".")
@@ -105,7 +106,7 @@ def task(course: Course, described: Fleet) -> dict[str, Any]:
 
 
 def _wires() -> dict[str, dict[str, object]]:
-    """What becomes of outputs of the blocks that are not there, by task."""
+    """What becomes of outputs of the blocks that are not there, by task; None: the wire goes, too."""
     drive: dict[str, object] = {
         "clearance.data": "perceive_message.out", "clearance.flag": 1, "clearance.age": 0,
         "clearance.sequence": "robot.scans", "command.flag": "heard.on", "in.v": "script.position[0]",
@@ -114,7 +115,7 @@ def _wires() -> dict[str, dict[str, object]]:
     for index, name in enumerate(AXES):
         drive |= {
             f"{name}.enabled": f"robot.enabled[{index}]", f"{name}.position": f"robot.position[{index}]",
-            f"{name}.flag": 1,
+            f"{name}.flag": 1, f"{name}.sequence": None,
         }  # fmt: skip
     return {"drive": drive, "perceive": {"laser.ranges": "robot.ranges", "laser.flag": "sound.on",
                                          "laser.age": SCAN_AGE_S}}  # fmt: skip

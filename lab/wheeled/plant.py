@@ -104,7 +104,7 @@ def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[s
     }
     for name in AXES:
         blocks[name] = _pulses([(trouble, trouble.code) for trouble in plant.troubles if trouble.what == name])
-    return {"period": f"{PERIOD_MS} ms", "phase": "1 ms", "priority": priority, "overruns": 0, "blocks": blocks}
+    return {"period": f"{PERIOD_MS} ms", "phase": "1.5 ms", "priority": priority, "overruns": 0, "blocks": blocks}
 
 
 def steps(rows: Sequence[tuple[float, Sequence[float]]]) -> dict[str, Any]:

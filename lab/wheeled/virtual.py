@@ -30,7 +30,9 @@ from lab.wheeled.plant import BITRATE, Plant, Trouble
 
 HERE = Path(__file__).parent
 DIRECTORY = subject.DIRECTORY
-CAN_BOARDS = ("-object", "can-bus,id=bus", *("-device", "kvaser_pci,canbus=bus") * 2)
+CAN_BOARDS = (
+    "-object", "can-bus,id=bus", *("-device", "kvaser_pci,canbus=bus,addr=9"), *("-device", "kvaser_pci,canbus=bus,addr=8"),
+)  # fmt: skip
 OWN, DRIVES = "can0", "can1"
 LASER = "/dev/robot/laser"
 COMMAND_PORT = 5030
