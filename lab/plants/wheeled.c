@@ -39,6 +39,7 @@ const struct wheeled_range wheeled_ranges[] = {
     RANGE(boom_load, "N·m", 0, 1e3),
     RANGE(boom_damping, "N·m·s", 0, 1),
     RANGE(boom_end, "rad", 0, 1e4),
+    RANGE(boom_begin, "rad", 0, 1e4),
     RANGE(lag, "s", 0.002, 1),
     RANGE(position_gain, "1/s", 0, 100),
     RANGE(counts_per_rad, "", 1, 1e7),
@@ -89,6 +90,7 @@ void wheeled_begin(struct wheeled *robot, const struct wheeled_parameters *param
     if (count)
         memcpy(robot->walls, walls, 4 * count * sizeof *walls);
     memcpy(robot->pose, parameters->initial_pose, sizeof robot->pose);
+    robot->axis[WHEELED_BOOM].angle = fmin(parameters->boom_begin, parameters->boom_end);
     robot->stream = plant_random(&seed);
     robot->least = wheeled_nearest(robot);
 }

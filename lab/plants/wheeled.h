@@ -51,6 +51,7 @@ struct wheeled_parameters {
     double boom_load;      /* N·m against extension */
     double boom_damping;   /* N·m·s */
     double boom_end;       /* rad of the gear's output at full extension; 0: retracted */
+    double boom_begin;     /* rad, where it is at first */
     double lag;            /* s, of the drives' speed loop */
     double position_gain;  /* 1/s, of the drives' position loop */
     double counts_per_rad; /* of the encoders, at the gears' output */

@@ -37,6 +37,20 @@ def run(*argv: str) -> None:
         raise RuntimeError(f"{' '.join(argv)}: status {done.returncode}: {done.stdout}{done.stderr}")
 
 
+def report(interface: str, what: int) -> None:
+    """A report of the controller, as its driver would make it: the kernel hands the frame to who asked for reports."""
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+        can.bind((interface,))
+        can.send(struct.pack("=IB3x8x", socket.CAN_ERR_FLAG | what, 8))
+
+
+def happen(what: list[Any]) -> None:
+    if what[0] == "report":
+        report(*what[1:])
+    else:
+        run(*what)
+
+
 def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
     """One control task, as its unit would start it."""
     out.mkdir(parents=True)
@@ -93,7 +107,7 @@ def drive(course: dict[str, Any], session: dict[str, Any], out: Path) -> None:
         at_s = index * _INTERVAL_S
         time.sleep(max(0.0, begin_ns / 1e9 + at_s - time.monotonic()))
         while events and events[0][0] <= at_s + 1e-6:
-            run(*events.pop(0)[1])
+            happen(events.pop(0)[1])
             happened.append(time.monotonic_ns())
         command(station, course["commands"], at_s)
         station.hear()

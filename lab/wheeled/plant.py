@@ -26,6 +26,8 @@ PERIOD_MS = 2
 RECORD_STEPS = 5
 """Between two records."""
 BITRATE = 1_000_000
+NO_HOME = 1
+"""In place of an error code: no fault, but a drive that is to search its home says that it cannot find it."""
 _AT_ONCE_S = 1e-6
 
 
@@ -36,7 +38,7 @@ class Trouble:
     begin_s: float
     end_s: float
     what: str
-    """`scanner`: it is unplugged; `left`, `right` or `boom`: the drive finds a fault at the beginning."""
+    """`scanner`: it is unplugged; `left`, `right` or `boom`: the drive finds a fault at the beginning, or no home."""
     code: int = 0x2310
     """EMCY error code: overcurrent."""
 
@@ -57,7 +59,7 @@ AXES = ("left", "right", "boom")
 def task(plant: Plant, interface: str, laser: str, priority: int = 40) -> dict[str, Any]:
     """Drives on a CAN interface, the scanner at the link `laser`.
 
-    Of less priority than the robot's tasks and between their releases: devices have processors of their own.
+    Of less priority than the robot's tasks and not released with them: devices have processors of their own.
     """
     blocks: dict[str, Any] = {
         "drives": {

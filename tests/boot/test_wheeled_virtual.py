@@ -15,10 +15,9 @@ from lab.scenarios.flight import Record
 from lab.wheeled import virtual
 from lab.wheeled.by_wires import fleet
 from lab.wheeled.plant import BITRATE
-from lab.wheeled.virtual import COURSE, SILENT_S, TOWARDS_S, TROUBLES, Driven
+from lab.wheeled.virtual import BOOM_RAD, COURSE, CURVE_S, SILENT_S, TOWARDS_S, TROUBLES, Driven
 
-JITTER_NS = {"drive": 100_000, "perceive": 400_000}
-"""Not yet 100 µs for `perceive`."""
+JITTER_NS = 100_000
 LEFT_M = (0.105, 0.2)
 """Before a wall that it runs at from 0.5 m/s: 5 cm around it and the margin of 6 cm, less the noise of a scan."""
 DEAD_MAN_S = 1.0
@@ -77,6 +76,43 @@ def test_it_is_driven_by_a_station(course: Driven) -> None:
     assert all(report["lost"] == 0 for report in reports)
 
 
+def test_it_reports_the_motion_that_it_makes(course: Driven) -> None:
+    """In a curve, by wheels whose drives answer after the next step where `perceive` has the processor.
+
+    Seen to fail by odometry that took angles in each step: no motion then, and twice as much in the next one.
+    """
+    told = course.told(*CURVE_S)
+    for axis, name, unit in ((0, "v", "m/s"), (1, "omega", "rad/s")):
+        found = [report["motion"][axis] for report in told]
+        print(f"{name} from {min(found):.3f} to {max(found):.3f} {unit}, where 0.3 was driven")
+        assert all(each == pytest.approx(0.3, rel=0.1) for each in found)
+
+
+def test_the_boom_finds_its_home_while_the_robot_drives(course: Driven) -> None:
+    """It is out at first, goes to its end stop, 1 mm away from it, and then as it is told."""
+    assert course.plant[0]["position"][2] == pytest.approx(BOOM_RAD, abs=0.01)
+    (searching,) = course.told(4.5, 4.59)
+    assert not searching["boom_enabled"]
+    assert searching["left"] and searching["right"]
+    assert searching["motion"][0] > 0.3
+    assert min(record["position"][2] for record in course.between(3, 8)) < 0.01
+    assert course.told(8, 8.2)[0]["boom_enabled"]
+    assert course.plant[-1]["position"][2] == pytest.approx(2 * math.pi * (0.1 + 0.001) / 0.01, abs=0.2)
+    begin = next(record for record in course.plant if record["powered"][2])
+    end = next(report for report in course.reports if report["boom_enabled"])
+    print(f"home {course.at_s(end) - course.at_s(begin):.1f} s after its power, from {BOOM_RAD:g} rad")
+
+
+def test_a_boom_without_its_home_stays_off(troubles: Driven) -> None:
+    """And the robot drives. It is tried again when the motors are switched on again."""
+    assert said(troubles.logs["drive"], "drive 3", "home failed")
+    (report,) = troubles.told(5, 5.09)
+    assert not report["boom_enabled"]
+    assert not at_rest(troubles.between(5, 6)[-1])
+    assert not any(record["powered"][2] for record in troubles.between(4, 16))
+    assert troubles.told(19, 19.2)[0]["boom_enabled"]
+
+
 def test_it_stops_before_a_wall(course: Driven) -> None:
     """Whatever the station commands."""
     begin_s, end_s = TOWARDS_S
@@ -103,7 +139,7 @@ def test_steps_are_on_time(driven: dict[str, Driven], task: str) -> None:
         found = each.statistics[task]
         print(f"{name}: {task}: jitter {found['jitter']['max_ns'] / 1e3} µs, step {found['step']['max_ns'] / 1e3} µs")
         assert found["overruns"] == 0
-        assert found["jitter"]["max_ns"] < JITTER_NS[task]
+        assert found["jitter"]["max_ns"] < JITTER_NS
 
 
 def busiest(records: Sequence[Record]) -> float:
@@ -149,6 +185,17 @@ def test_without_its_bus_it_stops(troubles: Driven) -> None:
     assert said(troubles.logs["drive"], "can0", "down")
     assert not at_rest(troubles.between(28, 29)[-1]), "it does not go on"
     assert troubles.plant[-1]["contacts"] == 0
+
+
+def test_with_its_controller_bus_off_it_stops(troubles: Driven) -> None:
+    """By what its driver reports, and drives that hear nothing; with a restart it goes on, as after any loss.
+
+    Seen to fail without the report: the journal has a lost heartbeat only.
+    """
+    rests(troubles, 29, STOPS_S, 33)
+    assert said(troubles.logs["drive"], "can0", "bus-off")
+    assert not any(report["left"] or report["right"] for report in troubles.told(29.5, 31))
+    assert not at_rest(troubles.between(35, 36)[-1]), "it does not go on"
 
 
 def test_a_drive_repeats_to_the_byte(driven: dict[str, Driven], artefacts: Path) -> None:
