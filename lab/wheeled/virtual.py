@@ -30,9 +30,10 @@ from lab.wheeled.plant import BITRATE, NO_HOME, Plant, Trouble
 
 HERE = Path(__file__).parent
 DIRECTORY = subject.DIRECTORY
-# In slots whose interrupts differ. A shared one would wake the robot's interrupt threads for the drives' board, too.
+# In slots whose interrupts differ: one that they share would wake the robot's threads for the drives' board, too.
 CAN_BOARDS = (
-    "-object", "can-bus,id=bus", *("-device", "kvaser_pci,canbus=bus,addr=9"), *("-device", "kvaser_pci,canbus=bus,addr=8"),
+    "-object", "can-bus,id=bus",
+    "-device", "kvaser_pci,canbus=bus,addr=6", "-device", "kvaser_pci,canbus=bus,addr=7",
 )  # fmt: skip
 OWN, DRIVES = "can0", "can1"
 BUS_OFF, RESTARTED = 0x40, 0x100

@@ -93,7 +93,8 @@ def test_the_boom_finds_its_home_while_the_robot_drives(course: Driven) -> None:
     assert course.plant[0]["position"][2] == pytest.approx(BOOM_RAD, abs=0.01)
     (searching,) = course.told(4.5, 4.59)
     assert not searching["boom_enabled"]
-    assert searching["left"] and searching["right"]
+    assert searching["left"]
+    assert searching["right"]
     assert searching["motion"][0] > 0.3
     assert min(record["position"][2] for record in course.between(3, 8)) < 0.01
     assert course.told(8, 8.2)[0]["boom_enabled"]
