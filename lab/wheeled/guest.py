@@ -8,6 +8,7 @@ files that tasks left, in base64: recordings, statistics, and what they said.
 from __future__ import annotations
 
 import base64
+import fcntl
 import json
 import os
 import signal
@@ -28,6 +29,7 @@ _END_S = 5.0
 """For tasks to end."""
 _TOLD_S = 5.0
 CONSOLE = Path("/dev/console")
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 1
 
 
 def run(*argv: str) -> None:
@@ -44,11 +46,16 @@ def report(interface: str, what: int) -> None:
         can.send(struct.pack("=IB3x8x", socket.CAN_ERR_FLAG | what, 8))
 
 
-def happen(what: list[Any]) -> None:
-    if what[0] == "report":
-        report(*what[1:])
-    else:
-        run(*what)
+def link(interface: str, state: str) -> None:
+    """Set it up or down, in no time: a program takes half a second here, in which the station would be silent."""
+    name = interface.encode()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_:
+        (flags,) = struct.unpack("16xh22x", fcntl.ioctl(any_, _SIOCGIFFLAGS, struct.pack("16s24x", name)))
+        flags = flags | _IFF_UP if state == "up" else flags & ~_IFF_UP
+        fcntl.ioctl(any_, _SIOCSIFFLAGS, struct.pack("16sh22x", name, flags))
+
+
+_HAPPENS = {"link": link, "report": report}
 
 
 def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
@@ -107,7 +114,8 @@ def drive(course: dict[str, Any], session: dict[str, Any], out: Path) -> None:
         at_s = index * _INTERVAL_S
         time.sleep(max(0.0, begin_ns / 1e9 + at_s - time.monotonic()))
         while events and events[0][0] <= at_s + 1e-6:
-            happen(events.pop(0)[1])
+            what, *arguments = events.pop(0)[1]
+            _HAPPENS[what](*arguments)
             happened.append(time.monotonic_ns())
         command(station, course["commands"], at_s)
         station.hear()

@@ -60,7 +60,7 @@ class Course:
     """None: silence."""
     plant: Plant = field(default_factory=Plant)
     events: Sequence[tuple[float, Sequence[str | int]]] = ()
-    """Commands that are run on the robot's computer; or `report`, a CAN interface, and what its controller reports."""
+    """`link`, an interface, and `down` or `up`; or `report`, a CAN interface, and what its controller reports."""
 
 
 _OFF: Said = (0, 0, 0, False)
@@ -80,7 +80,6 @@ COURSE = Course(
 
 The boom searches its home meanwhile, and then goes where it is told to.
 """
-CURVE_S = (6.5, 8.0)
 SILENT_S = 23.0
 TOWARDS_S = (9.5, 18.5)
 _AROUND: Said = (0.3, 0.6, 0, True)
@@ -92,9 +91,9 @@ TROUBLES = Course(
     ],
     Plant(troubles=[Trouble(0.5, 15, "boom", NO_HOME), Trouble(7, 10, "scanner"), Trouble(13, 14, "left", 0x2310)]),
     [
-        (20, ("ip", "link", "set", OWN, "down")), (22, ("ip", "link", "set", OWN, "up")),
-        (29, ("ip", "link", "set", DRIVES, "down")), (29, ("report", OWN, BUS_OFF)),
-        (31, ("ip", "link", "set", DRIVES, "up")), (31, ("report", OWN, RESTARTED)),
+        (20, ("link", OWN, "down")), (22, ("link", OWN, "up")),
+        (29, ("link", DRIVES, "down")), (29, ("report", OWN, BUS_OFF)),
+        (31, ("link", DRIVES, "up")), (31, ("report", OWN, RESTARTED)),
     ],
 )  # fmt: skip
 """Round and round; its boom finds no home, its scanner is unplugged for a while, a drive faults, its interface is set
