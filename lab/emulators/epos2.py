@@ -2,7 +2,8 @@
 
 Facts: Maxon, EPOS2 Firmware Specification, and the drive's EDS; CiA 301 4.2; CiA 402-2. The device is told the time, so
 it can run in any: `Epos2.handle` and `Epos2.advance` return the frames it sends, and `Epos2Server` does both on a bus
-in real time. On demand it faults, refuses objects, falls silent, loses frames and its power, and talks nonsense.
+in real time. It homes by an end stop, by a limit switch
+or where it is. On demand it faults, refuses objects, falls silent, loses frames and its power, and talks nonsense.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ POWERED = {Axis.OPERATION_ENABLED, Axis.QUICK_STOP_ACTIVE, Axis.FAULT_REACTION_A
 
 REMOTE_BIT = 0x0200
 TARGET_REACHED = 0x0400
-SETPOINT_ACKNOWLEDGED = 0x1000
+SETPOINT_ACKNOWLEDGED = HOMING_ATTAINED = 0x1000
+HOMING_ERROR = 0x2000
+REFERENCED = 0x8000
 
 
 class Abort(Exception):
@@ -85,7 +88,13 @@ SAVE = int.from_bytes(b"save", "little")
 """What is written to 1010:1 to store all."""
 
 MODE_POSITION, MODE_VELOCITY, MODE_CURRENT = -1, -2, -3
-MODE_PROFILE_POSITION, MODE_PROFILE_VELOCITY = 1, 3
+MODE_PROFILE_POSITION, MODE_PROFILE_VELOCITY, MODE_HOMING = 1, 3, 6
+END_STOP = {-3: 1, -4: -1}
+"""Direction in which a method of object 6098 searches an end stop, which the drive feels by its current."""
+SWITCH = {17: -1, 18: 1}
+"""Likewise of a limit switch."""
+HERE = 35
+"""The method that takes the actual position for the home."""
 MODES = {MODE_POSITION, MODE_VELOCITY, MODE_CURRENT, MODE_PROFILE_POSITION, MODE_PROFILE_VELOCITY, 6, 7, -5, -6}
 
 
@@ -133,6 +142,14 @@ def shipped(node: int) -> dict[Name, Entry]:
         (0x6083, 0): Entry(4, 10000, mapped="r"),
         (0x6084, 0): Entry(4, 10000, mapped="r"),
         (0x6085, 0): Entry(4, 10000, mapped="r"),
+        (0x6098, 0): _signed(1, value=7),
+        (0x6099, 0): Entry(1, 2, access="ro"),
+        (0x6099, 1): Entry(4, 100),
+        (0x6099, 2): Entry(4, 10),
+        (0x609A, 0): Entry(4, 1000),
+        (0x607C, 0): _signed(4),
+        (0x2080, 0): Entry(2, 500),
+        (0x2081, 0): _signed(4),
         (0x60FF, 0): _signed(4, mapped="rt"),
         (0x6502, 0): Entry(4, 0x65, access="ro"),  # profile position and velocity, homing, interpolated position
         (0x6410, 0): Entry(1, 5, access="ro"),
@@ -179,6 +196,8 @@ class Motor:
     rpm: float = 0
     current: float = 0  # A
     load: float = 0  # N·m, against the motion's positive direction
+    stops: tuple[float, float] | None = None  # turns between which the load can move
+    switches: tuple[float, float] | None = None  # turns below and above which a limit switch is closed
 
     def drive_current(self, amperes: float, seconds: float) -> None:
         radians = self.rpm * 0.10471975511965977
@@ -196,6 +215,14 @@ class Motor:
         rpm = radians_per_s / 0.10471975511965977
         self.turns += (self.rpm + rpm) / 2 / 60 * seconds
         self.rpm = rpm
+        if self.stops and not self.stops[0] <= self.turns <= self.stops[1]:
+            self.turns, self.rpm = max(self.stops[0], min(self.stops[1], self.turns)), 0
+
+    def on_switch(self, direction: int) -> bool:
+        """The limit switch in a direction, 1 or -1, is closed."""
+        if self.switches is None:
+            return False
+        return self.turns <= self.switches[0] if direction < 0 else self.turns >= self.switches[1]
 
     @property
     def counts(self) -> int:
@@ -212,6 +239,7 @@ class Misbehaviour:
     nonsense: float = 0  # frames of random content for each of its own
     stuck_axis: bool = False  # the axis ignores the control word
     nmt_keeps_axis: bool = False  # the axis goes on whatever NMT commands
+    homing_error: bool = False  # each search for the home fails
 
 
 class Epos2:
@@ -245,7 +273,9 @@ class Epos2:
     def _reset_node(self) -> None:
         self.axis = Axis.SWITCH_ON_DISABLED
         self.objects = self._restored()
-        self.motor.turns = 0
+        self._zero = self.motor.counts  # the encoder counts from 0
+        self.referenced = self.homing_error = False
+        self._homing: Iterator[None] | None = None
         self._control = 0
         self._demand_rpm = 0.0
         self._demand_turns: float | None = None
@@ -418,6 +448,8 @@ class Epos2:
             self._check_mapping(index, sub, value)
         if (index, sub) == (0x6060, 0) and value not in MODES:
             raise Abort(Abort.OUT_OF_RANGE)
+        if (index, sub) == (0x6098, 0) and value not in {*END_STOP, *SWITCH, HERE, 7}:
+            raise Abort(Abort.OUT_OF_RANGE)
         if (index, sub) == (0x1010, 1):
             if value != SAVE:
                 raise Abort(Abort.NOT_STORED)
@@ -446,7 +478,7 @@ class Epos2:
     def _written(self, index: int) -> None:
         if index == 0x6040:
             self._obey(self.objects[0x6040, 0].value)
-        elif index == 0x6060:
+        elif index == 0x6060 and self.objects[0x6061, 0].value != self.objects[0x6060, 0].value:
             self.objects[0x6061, 0].value = self.objects[0x6060, 0].value
             self._demand_rpm, self._demand_turns = self.motor.rpm, None
 
@@ -523,8 +555,13 @@ class Epos2:
                 self._emit(Frame(0x80 + self.node, bytes(8)))
         elif self.axis is not Axis.FAULT_REACTION_ACTIVE:
             self._transit(word)
-        if rising & 0x10 and self.axis is Axis.OPERATION_ENABLED:
-            self._demand_turns = self.objects[0x607A, 0].value / self.motor.counts_per_turn
+        if not word & 0x10:
+            self._homing = None
+        if rising & 0x10 and self.axis is Axis.OPERATION_ENABLED and self.objects[0x6061, 0].value == MODE_HOMING:
+            self.referenced, self.homing_error = False, self.wrong.homing_error
+            self._homing = None if self.homing_error else self._search()
+        elif rising & 0x10 and self.axis is Axis.OPERATION_ENABLED:
+            self._demand_turns = self._turns(self.objects[0x607A, 0].value)
             if word & 0x40:
                 self._demand_turns += self.motor.turns
             self._acknowledged = True
@@ -554,14 +591,19 @@ class Epos2:
             word |= REMOTE_BIT
         if self._acknowledged and self.objects[0x6061, 0].value == MODE_PROFILE_POSITION:
             word |= SETPOINT_ACKNOWLEDGED
-        if self.axis is Axis.OPERATION_ENABLED and self._demand_turns is not None:
+        if self.referenced:
+            word |= REFERENCED
+        if self.objects[0x6061, 0].value == MODE_HOMING:
+            word |= HOMING_ATTAINED | TARGET_REACHED if self.referenced else 0
+            word |= HOMING_ERROR if self.homing_error else 0
+        elif self.axis is Axis.OPERATION_ENABLED and self._demand_turns is not None:
             word |= TARGET_REACHED if abs(self._demand_turns - self.motor.turns) < 0.002 else 0
         return word
 
     def _show(self) -> None:
         for index, value in (
             (0x6041, self._status()),
-            (0x6064, self.motor.counts),
+            (0x6064, self.motor.counts - self._zero),
             (0x606C, round(self.motor.rpm)),
             (0x6078, round(self.motor.current * 1000)),
         ):
@@ -603,9 +645,40 @@ class Epos2:
             target = 0 if halted else max(-fastest, min(fastest, self.objects[0x60FF, 0].value))
             self._ramp(target, self.objects[0x6083, 0].value)
         elif mode == MODE_POSITION:
-            self._approach(self.objects[0x2062, 0].value / self.motor.counts_per_turn, fastest)
+            self._approach(self._turns(self.objects[0x2062, 0].value), fastest)
+        elif mode == MODE_HOMING:
+            if self._homing is None:
+                self._ramp(0, self.objects[0x609A, 0].value)
+            elif next(self._homing, self) is self:
+                self._homing = None
         elif mode == MODE_PROFILE_POSITION and self._demand_turns is not None:
             self._approach(self._demand_turns, min(fastest, self.objects[0x6081, 0].value))
+
+    def _turns(self, position: int) -> float:
+        """Of the motor, at a position as objects have it."""
+        return (position + self._zero) / self.motor.counts_per_turn
+
+    def _search(self) -> Iterator[None]:
+        """Homing, by the method of object 6098, a cycle at a time."""
+        method, speed = self.objects[0x6098, 0].value, self.objects[0x6099, 1].value
+        offset = self.objects[0x607C, 0].value
+        direction = END_STOP.get(method) or SWITCH.get(method, 0)
+        self._demand_rpm = self.motor.rpm
+        while direction and not self._found(method, direction):
+            self._ramp(direction * speed, self.objects[0x609A, 0].value)
+            yield
+        home = self.motor.counts + offset
+        while abs(self.motor.counts - home) > 2:
+            self._approach(home / self.motor.counts_per_turn, speed)
+            yield
+        self._demand_rpm = 0
+        self._zero = home - self.objects[0x2081, 0].value
+        self.referenced = True
+
+    def _found(self, method: int, direction: int) -> bool:
+        if method in SWITCH:
+            return self.motor.on_switch(direction)
+        return abs(self.motor.current) * 1000 >= self.objects[0x2080, 0].value
 
     def _approach(self, turns: float, fastest: float) -> None:
         rpm = (turns - self.motor.turns) * self.motor.position_gain * 60

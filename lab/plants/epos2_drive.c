@@ -1,9 +1,11 @@
 #include "epos2_drive.h"
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 enum { READ_ONLY = 1, INTO_RPDO = 2, INTO_TPDO = 4 };
+enum { HOMING = 6 };
 enum { BOOTING = 0x00, STOPPED = 0x04, OPERATIONAL = 0x05, PRE_OPERATIONAL = 0x7F };
 
 /* Abort codes, CiA 301, 7.2.4.3.17. */
@@ -121,6 +123,14 @@ static void add_objects(struct drive *drive)
     add(drive, 0x6085, 0, 4, 0, 10000);
     add(drive, 0x6410, 1, 2, 0, 2000);
     add(drive, 0x6410, 2, 2, 0, 4000);
+    add(drive, 0x6098, 0, 1, 0, 7);
+    add(drive, 0x6099, 0, 1, READ_ONLY, 2);
+    add(drive, 0x6099, 1, 4, 0, 100);
+    add(drive, 0x6099, 2, 4, 0, 10);
+    add(drive, 0x609A, 0, 4, 0, 1000);
+    add(drive, 0x607C, 0, 4, 0, 0);
+    add(drive, 0x2080, 0, 2, 0, 500);
+    add(drive, 0x2081, 0, 4, 0, 0);
     add(drive, 0x2030, 0, 2, INTO_RPDO | INTO_TPDO, 0);
     add(drive, 0x2062, 0, 4, INTO_RPDO | INTO_TPDO, 0);
     add(drive, 0x206B, 0, 4, INTO_RPDO | INTO_TPDO, 0);
@@ -128,9 +138,15 @@ static void add_objects(struct drive *drive)
 
 static void show(struct drive *drive)
 {
-    uint32_t remote = drive->nmt == OPERATIONAL ? 0x0200 : 0;
-    find(drive, 0x6041, 0)->value = (uint32_t)drive->axis | remote;
-    find(drive, 0x6064, 0)->value = (uint32_t)drive->counts;
+    uint32_t bits = drive->nmt == OPERATIONAL ? 0x0200 : 0;
+    if (drive->referenced)
+        bits |= 0x8000;
+    if (value_of(drive, 0x6061, 0) == HOMING && drive->referenced)
+        bits |= 0x1400; /* attained, and there */
+    if (value_of(drive, 0x6061, 0) == HOMING && drive->homing_error)
+        bits |= 0x2000;
+    find(drive, 0x6041, 0)->value = (uint32_t)drive->axis | bits;
+    find(drive, 0x6064, 0)->value = (uint32_t)drive->counts - (uint32_t)drive->zero;
     find(drive, 0x606C, 0)->value = (uint32_t)drive->rpm;
     find(drive, 0x6078, 0)->value = (uint32_t)drive->milliamperes & 0xFFFF;
 }
@@ -178,12 +194,20 @@ static void obey(struct drive *drive, uint16_t word)
 {
     uint16_t rising = (uint16_t)(word & ~drive->control);
     drive->control = word;
+    if (!(word & 0x10))
+        drive->homing = DRIVE_NOT_HOMING;
     if (drive->axis == DRIVE_FAULT && rising & 0x80) {
         drive->axis = DRIVE_SWITCH_ON_DISABLED;
         find(drive, 0x1001, 0)->value = 0;
         emit(drive, 0x80u + drive->node, (const uint8_t[8]){0}, 8);
     } else if (drive->axis != DRIVE_FAULT && drive->axis != DRIVE_FAULT_REACTION) {
         transit(drive, word);
+    }
+    if (rising & 0x10 && drive->axis == DRIVE_OPERATION_ENABLED && value_of(drive, 0x6061, 0) == HOMING) {
+        drive->referenced = false;
+        drive->homing_error = drive->homing_fails;
+        drive->ramp_rpm = drive->rpm;
+        drive->homing = drive->homing_fails ? DRIVE_NOT_HOMING : DRIVE_SEARCHING;
     }
 }
 
@@ -200,6 +224,32 @@ static double limited(double value, double limit)
     return fmax(-limit, fmin(limit, value));
 }
 
+/* Up to an end stop, and away from it by the offset, which is the home. */
+static void home(struct drive *drive, double seconds)
+{
+    int8_t method = (int8_t)value_of(drive, 0x6098, 0);
+    int32_t rpm = (int32_t)value_of(drive, 0x6099, 1), offset = (int32_t)value_of(drive, 0x607C, 0);
+    bool stopped = (uint32_t)abs(drive->milliamperes) >= value_of(drive, 0x2080, 0);
+    drive->mode = -2;
+    drive->demand = 0;
+    if (drive->homing == DRIVE_SEARCHING && (method == 35 || stopped)) {
+        drive->homing = DRIVE_LEAVING;
+        drive->found = drive->counts;
+    } else if (drive->homing == DRIVE_SEARCHING) {
+        double change = value_of(drive, 0x609A, 0) * seconds;
+        drive->ramp_rpm += limited((method == -4 ? -rpm : rpm) - drive->ramp_rpm, change);
+        drive->demand = drive->ramp_rpm;
+    }
+    if (drive->homing == DRIVE_LEAVING && abs(drive->counts - drive->found - offset) <= 20) {
+        drive->zero = drive->found + offset - (int32_t)value_of(drive, 0x2081, 0);
+        drive->referenced = true;
+        drive->homing = DRIVE_NOT_HOMING;
+    } else if (drive->homing == DRIVE_LEAVING) {
+        drive->mode = -1;
+        drive->demand = drive->found + offset;
+    }
+}
+
 /* What the inner loops are told. */
 static void command(struct drive *drive, double seconds)
 {
@@ -211,8 +261,10 @@ static void command(struct drive *drive, double seconds)
         drive->demand = drive->ramp_rpm;
         if (drive->axis == DRIVE_FAULT_REACTION && fabs(drive->ramp_rpm) < 1)
             drive->axis = DRIVE_FAULT;
+    } else if (drive->mode == HOMING) {
+        home(drive, seconds);
     } else if (drive->mode == -1) {
-        drive->demand = (int32_t)value_of(drive, 0x2062, 0);
+        drive->demand = (double)(int32_t)value_of(drive, 0x2062, 0) + drive->zero;
     } else if (drive->mode == -2) {
         drive->demand = limited((int32_t)value_of(drive, 0x206B, 0), value_of(drive, 0x607F, 0));
     } else if (drive->mode == -3) {
@@ -248,7 +300,9 @@ static uint32_t write_object(struct drive *drive, struct drive_entry *entry, uin
         return WRONG_LENGTH;
     if (entry->index == 0x607F && value > 25000)
         return OUT_OF_RANGE;
-    if (entry->index == 0x6060 && value != 0xFF && value != 0xFE && value != 0xFD)
+    if (entry->index == 0x6060 && value != 0xFF && value != 0xFE && value != 0xFD && value != HOMING)
+        return OUT_OF_RANGE;
+    if (entry->index == 0x6098 && value != 0xFC && value != 0xFD && value != 35)
         return OUT_OF_RANGE;
     if ((entry->index & 0xFFFC) == 0x1600 || (entry->index & 0xFFFC) == 0x1A00) {
         uint32_t abort = check_mapping(drive, entry->index, entry->sub, value);
@@ -344,14 +398,17 @@ static void synchronise(struct drive *drive)
 
 static void reset(struct drive *drive, bool whole)
 {
-    uint32_t mode = 0xFE, counts = (uint32_t)drive->counts;
+    uint32_t mode = 0xFE;
     if (!whole)
         mode = value_of(drive, 0x6060, 0);
     add_objects(drive);
     find(drive, 0x6060, 0)->value = find(drive, 0x6061, 0)->value = mode;
-    find(drive, 0x6064, 0)->value = counts;
-    if (whole)
+    if (whole) {
         drive->axis = DRIVE_SWITCH_ON_DISABLED;
+        drive->zero = drive->counts; /* the encoder counts from 0 */
+        drive->referenced = false;
+    }
+    drive->homing = DRIVE_NOT_HOMING;
     drive->nmt = PRE_OPERATIONAL;
     drive->heard_ns = 0;
     drive->beat_ns = drive->now_ns;
@@ -373,9 +430,9 @@ static void lead(struct drive *drive, uint8_t what)
         reset(drive, what == 0x81);
 }
 
-void drive_begin(struct drive *drive, uint8_t node, int64_t now_ns)
+void drive_begin(struct drive *drive, uint8_t node, int64_t now_ns, int32_t counts)
 {
-    *drive = (struct drive){.node = node, .now_ns = now_ns};
+    *drive = (struct drive){.node = node, .now_ns = now_ns, .counts = counts};
     reset(drive, true);
 }
 

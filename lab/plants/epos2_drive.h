@@ -3,8 +3,9 @@
  * time.
  *
  * It knows SDO (expedited), NMT, heartbeats both ways, EMCY, PDOs that are sent at each SYNC and taken at once, and the
- * state machine of CiA 402 in the modes position (-1), velocity (-2) and current (-3). It does not know PDOs by event,
- * profiles, homing, and storing. Its motor is elsewhere: `measured` comes in, `demand` goes out.
+ * state machine of CiA 402 in the modes position (-1), velocity (-2), current (-3) and homing (6) by an end stop that
+ * it feels by its current (methods -3 and -4), or where it is (35). It does not know PDOs by event, profiles, and
+ * storing. Its motor is elsewhere: `measured` comes in, `demand` goes out.
  *
  * Sources: CiA 301 4.2; CiA 402-2; Maxon, EPOS2 Firmware Specification.
  */
@@ -16,7 +17,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-enum { DRIVE_ENTRIES = 160, DRIVE_OUT = 16 };
+enum { DRIVE_ENTRIES = 176, DRIVE_OUT = 16 };
 
 struct drive_entry {
     uint16_t index;
@@ -46,17 +47,21 @@ struct drive {
     double ramp_rpm;                   /* of a quick stop */
     struct can_frame out[DRIVE_OUT];
     size_t out_count;
-    uint32_t dropped; /* frames for which `out` had no room */
+    enum { DRIVE_NOT_HOMING, DRIVE_SEARCHING, DRIVE_LEAVING } homing;
+    bool referenced, homing_error;
+    int32_t zero, found; /* counts of the motor at the position 0, and where the search ended */
+    uint32_t dropped;    /* frames for which `out` had no room */
 
     /* The motor, counts and rpm of its shaft, mA. */
     int32_t counts, rpm, milliamperes;
-    /* What it is told: mode of object 6061, or 0 for no power; counts, rpm or mA. */
+    bool homing_fails; /* set from outside: each search does */
+    /* What it is told: -1, -2 or -3 as in object 6061, or 0 for no power; counts of the motor, rpm or mA. */
     int8_t mode;
     double demand;
 };
 
-/* Power on: it says so. */
-void drive_begin(struct drive *drive, uint8_t node, int64_t now_ns);
+/* Power on, the motor at `counts`, which becomes the position 0: it says so. */
+void drive_begin(struct drive *drive, uint8_t node, int64_t now_ns, int32_t counts);
 
 /* Take a frame from the bus. What it sends is in `out`; the caller empties it by out_count = 0. */
 void drive_take(struct drive *drive, const struct can_frame *frame);

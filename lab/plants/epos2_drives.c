@@ -14,7 +14,7 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
-enum { DRIVES = WHEELED_AXES, BURST = 64 };
+enum { DRIVES = WHEELED_AXES, BURST = 64, HOMING_FAILS = 1 };
 
 struct drives {
     const char *interface;
@@ -40,7 +40,7 @@ static const struct fl_port inputs[] = {
      .type = FL_DOUBLE,
      .width = DRIVES,
      .flags = FL_OPTIONAL,
-     .summary = "code of a fault that the drive finds when this changes; 0: none"},
+     .summary = "code of a fault that the drive finds when this changes; 0: none; 1: no fault, but homing fails"},
 };
 
 enum { TARGET, ENABLE, MODE, FRAMES, BITS, LOST };
@@ -99,6 +99,11 @@ static void send_all(struct fl_block *block, struct state *state, struct drive *
     drive->out_count = 0;
 }
 
+static int32_t counts_of(const struct drives *set, double position)
+{
+    return (int32_t)lround(position * set->counts * set->gear / 6.28318530717958647693);
+}
+
 static void measure(struct fl_block *block, struct state *state)
 {
     const struct drives *set = block->parameters;
@@ -107,10 +112,11 @@ static void measure(struct fl_block *block, struct state *state)
     const double *error = block->in[ERROR];
     for (int i = 0; i < DRIVES; i++) {
         struct drive *drive = &state->drive[i];
-        drive->counts = (int32_t)lround(position[i] * set->counts * set->gear / tau);
+        drive->counts = counts_of(set, position[i]);
         drive->rpm = (int32_t)lround(speed[i] * set->gear * 60 / tau);
         drive->milliamperes = (int32_t)lround(1e3 * torque[i] / set->gear / set->torque_constant);
-        if (error[i] != state->error[i] && error[i] != 0)
+        drive->homing_fails = error[i] == HOMING_FAILS;
+        if (error[i] != state->error[i] && error[i] != 0 && !drive->homing_fails)
             drive_fail(drive, (uint16_t)error[i]);
         state->error[i] = error[i];
     }
@@ -146,7 +152,8 @@ static int step(struct fl_block *block)
     struct state *state = block->state;
     struct can_frame frame;
     for (int i = 0; !block->step && i < DRIVES; i++)
-        drive_begin(&state->drive[i], (uint8_t)set->nodes.value[i], block->release_ns);
+        drive_begin(&state->drive[i], (uint8_t)set->nodes.value[i], block->release_ns,
+                    counts_of(set, ((const double *)block->in[POSITION])[i]));
     measure(block, state);
     for (int n = 0; n < BURST && recv(state->fd, &frame, sizeof frame, MSG_DONTWAIT) == (ssize_t)sizeof frame; n++) {
         count(block, &frame);

@@ -39,6 +39,7 @@ const struct wheeled_range wheeled_ranges[] = {
     RANGE(boom_load, "N·m", 0, 1e3),
     RANGE(boom_damping, "N·m·s", 0, 1),
     RANGE(boom_end, "rad", 0, 1e4),
+    RANGE(boom_begin, "rad", 0, 1e4),
     RANGE(lag, "s", 0.002, 1),
     RANGE(position_gain, "1/s", 0, 100),
     RANGE(counts_per_rad, "", 1, 1e7),
@@ -89,6 +90,7 @@ void wheeled_begin(struct wheeled *robot, const struct wheeled_parameters *param
     if (count)
         memcpy(robot->walls, walls, 4 * count * sizeof *walls);
     memcpy(robot->pose, parameters->initial_pose, sizeof robot->pose);
+    robot->axis[WHEELED_BOOM].angle = fmin(parameters->boom_begin, parameters->boom_end);
     robot->stream = plant_random(&seed);
     robot->least = wheeled_nearest(robot);
 }
@@ -276,15 +278,20 @@ double wheeled_cast(const struct wheeled *robot, double bearing)
     return nearest;
 }
 
-void wheeled_scan(struct wheeled *robot, uint16_t millimetres[WHEELED_STEPS])
+void wheeled_scan_part(struct wheeled *robot, int first, int end, uint16_t millimetres[WHEELED_STEPS])
 {
     const double turn = 6.28318530717958647693, least = 0.02, most = 5.6; /* of a URG-04LX */
     const struct wheeled_parameters *set = &robot->parameters;
-    for (int step = WHEELED_FIRST; step <= WHEELED_LAST; step++) {
+    for (int step = first; step < end; step++) {
         double range = wheeled_cast(robot, (step - WHEELED_FRONT) * turn / WHEELED_TURN);
         double noise = fmax(set->range_noise, set->range_noise_relative * range);
         if (range <= most)
             range += noise * plant_deviate(&robot->stream);
         millimetres[step - WHEELED_FIRST] = (uint16_t)(range >= least && range <= most ? lround(1e3 * range) : 0);
     }
+}
+
+void wheeled_scan(struct wheeled *robot, uint16_t millimetres[WHEELED_STEPS])
+{
+    wheeled_scan_part(robot, WHEELED_FIRST, WHEELED_LAST + 1, millimetres);
 }

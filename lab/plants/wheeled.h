@@ -51,6 +51,7 @@ struct wheeled_parameters {
     double boom_load;      /* N·m against extension */
     double boom_damping;   /* N·m·s */
     double boom_end;       /* rad of the gear's output at full extension; 0: retracted */
+    double boom_begin;     /* rad, where it is at first */
     double lag;            /* s, of the drives' speed loop */
     double position_gain;  /* 1/s, of the drives' position loop */
     double counts_per_rad; /* of the encoders, at the gears' output */
@@ -129,5 +130,8 @@ double wheeled_cast(const struct wheeled *robot, double bearing);
 
 /* A scan in mm as a URG-04LX tells it, with noise: 0 where nothing is measured. */
 void wheeled_scan(struct wheeled *robot, uint16_t millimetres[WHEELED_STEPS]);
+
+/* The same of some steps, from `first` up to but not with `end`, where the robot is now: a scanner turns. */
+void wheeled_scan_part(struct wheeled *robot, int first, int end, uint16_t millimetres[WHEELED_STEPS]);
 
 #endif

@@ -64,7 +64,9 @@ static const struct fl_port outputs[] = {
 
 struct state {
     struct wheeled robot;
-    int64_t moved_ns, scanned_ns;
+    int64_t moved_ns, turn_ns; /* of the last step, of the begin of the scanner's turn */
+    int scanned;               /* steps before this one are measured in this turn */
+    uint16_t scan[WHEELED_STEPS];
 };
 
 static uint32_t range_count(const struct robot *set)
@@ -146,16 +148,13 @@ static void meet(struct fl_block *block)
     }
 }
 
-static void scan(struct fl_block *block)
+static void publish(struct fl_block *block)
 {
     const struct robot *set = block->parameters;
     struct state *state = block->state;
     uint16_t *millimetres = block->out[MILLIMETRES];
     double *ranges = block->out[RANGES];
-    if (block->step && block->release_ns - state->scanned_ns < (int64_t)(1e9 * set->scan_period))
-        return;
-    state->scanned_ns = block->release_ns;
-    wheeled_scan(&state->robot, millimetres);
+    memcpy(millimetres, state->scan, sizeof state->scan);
     FL_OUT(block, SCANS, uint32_t)++;
     for (uint32_t i = 0; i < range_count(set); i++) {
         uint16_t shortest = 0;
@@ -164,6 +163,28 @@ static void scan(struct fl_block *block)
                 shortest = millimetres[j];
         ranges[i] = shortest ? shortest / 1e3 : NAN;
     }
+}
+
+/* Measure what the scanner has turned to since the step before; the first scan is taken at once. More at once than that
+ * would keep the drives, which are of the same task, waiting for 4 ms. */
+static void scan(struct fl_block *block)
+{
+    const struct robot *set = block->parameters;
+    struct state *state = block->state;
+    int64_t period_ns = (int64_t)(1e9 * set->scan_period), turned_ns = block->release_ns - state->turn_ns;
+    if (!block->step || turned_ns >= period_ns) {
+        state->turn_ns = block->step && turned_ns < 2 * period_ns ? state->turn_ns + period_ns : block->release_ns;
+        state->scanned = WHEELED_FIRST;
+        turned_ns = block->step ? block->release_ns - state->turn_ns : period_ns;
+    }
+    int64_t due = WHEELED_FIRST + turned_ns * WHEELED_TURN / period_ns;
+    int end = due > WHEELED_LAST ? WHEELED_LAST + 1 : (int)due;
+    if (state->scanned >= end)
+        return;
+    wheeled_scan_part(&state->robot, state->scanned, end, state->scan);
+    state->scanned = end;
+    if (end > WHEELED_LAST)
+        publish(block);
 }
 
 /* By the releases and not by the period: time passes in a step that was left out, too. */

@@ -1,9 +1,9 @@
 """A release comes to a robot whose control runs, in virtual time: one guest that boots the shipped system from memory.
 
 All that takes a robot's processor is the image's: kernel, network, `flotilla-receive` and its service, `update.py`,
-`ssh-keygen`, `flotilla-patch`, `flotilla-slot`, `flotilla-run`. Slots hold a few MB instead of 70, and the card is in memory. A run
-repeats to the byte.
-"""  # noqa: E501 - one fact
+`ssh-keygen`, `flotilla-patch`, `flotilla-slot`, `flotilla-run`. Slots hold a few MB instead of 70, and the card is in
+memory. A run repeats to the byte.
+"""
 
 from __future__ import annotations
 

@@ -140,7 +140,8 @@ def _blocks(course: Course, described: Fleet, file: Path) -> dict[str, Any]:
                 continue
             if slower > 1:
                 told["every"] = slower
-            told["in"] = {port: _wire(wires[name], name, wire) for port, wire in told.get("in", {}).items()}
+            wired = {port: _wire(wires[name], name, wire) for port, wire in told.get("in", {}).items()}
+            told["in"] = {port: end for port, end in wired.items() if end is not None}
             blocks[f"{name}_{block}"] = told
     come = sorted([*datagrams(course.commands, course.seconds), *course.others], key=lambda each: each[0])
     file.write_bytes(b"".join(struct.pack("=d", at_s) + datagram for at_s, datagram in come))
@@ -172,7 +173,7 @@ def _blocks(course: Course, described: Fleet, file: Path) -> dict[str, Any]:
 
 
 def _wires() -> dict[str, dict[str, object]]:
-    """What becomes of outputs of the blocks that are not there, by task."""
+    """What becomes of outputs of the blocks that are not there, by task; None: the wire goes, too."""
     drive: dict[str, object] = {
         "clearance.data": "perceive_message.out", "clearance.flag": 1, "clearance.age": 0,
         "clearance.sequence": "robot.scans",
@@ -180,7 +181,7 @@ def _wires() -> dict[str, dict[str, object]]:
     for index, name in enumerate(AXES):
         drive |= {
             f"{name}.enabled": f"robot.enabled[{index}]", f"{name}.position": f"robot.position[{index}]",
-            f"{name}.flag": 1,
+            f"{name}.flag": 1, f"{name}.sequence": None,
         }  # fmt: skip
     return {"drive": drive, "perceive": {"laser.ranges": "robot.ranges", "laser.flag": "sound.on",
                                          "laser.age": SCAN_AGE_S}}  # fmt: skip

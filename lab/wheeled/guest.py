@@ -8,6 +8,7 @@ files that tasks left, in base64: recordings, statistics, and what they said.
 from __future__ import annotations
 
 import base64
+import fcntl
 import json
 import os
 import random
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ _END_S = 5.0
 """For tasks to end."""
 _TOLD_S = 5.0
 CONSOLE = Path("/dev/console")
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 1
 
 
 def run(*argv: str) -> None:
@@ -40,6 +43,25 @@ def run(*argv: str) -> None:
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{' '.join(argv)}: status {done.returncode}: {done.stdout}{done.stderr}")
+
+
+def report(interface: str, what: int) -> None:
+    """A report of the controller, as its driver would make it: the kernel hands the frame to who asked for reports."""
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+        can.bind((interface,))
+        can.send(struct.pack("=IB3x8x", socket.CAN_ERR_FLAG | what, 8))
+
+
+def link(interface: str, state: str) -> None:
+    """Set it up or down, in no time: a program takes half a second here, in which the station would be silent."""
+    name = interface.encode()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_:
+        (flags,) = struct.unpack("16xh22x", fcntl.ioctl(any_, _SIOCGIFFLAGS, struct.pack("16s24x", name)))
+        flags = flags | _IFF_UP if state == "up" else flags & ~_IFF_UP
+        fcntl.ioctl(any_, _SIOCSIFFLAGS, struct.pack("16sh22x", name, flags))
+
+
+_HAPPENS: dict[str, Callable[..., None]] = {"link": link, "report": report}
 
 
 def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
@@ -111,7 +133,8 @@ def drive(course: dict[str, Any], session: dict[str, Any], out: Path) -> None:
         at_s = index * _INTERVAL_S
         time.sleep(max(0.0, begin_ns / 1e9 + at_s - time.monotonic()))
         while events and events[0][0] <= at_s + 1e-6:
-            run(*events.pop(0)[1])
+            what, *arguments = events.pop(0)[1]
+            _HAPPENS[what](*arguments)
             happened.append(time.monotonic_ns())
         command(station, course["commands"], at_s)
         for begin_s, end_s, what in course["disturbances"]:

@@ -33,6 +33,8 @@ PERIOD_MS = 2
 RECORD_STEPS = 5
 """Between two records."""
 BITRATE = 1_000_000
+NO_HOME = 1
+"""In place of an error code: no fault, but a drive that is to search its home says that it cannot find it."""
 _AT_ONCE_S = 1e-6
 
 
@@ -43,7 +45,7 @@ class Trouble:
     begin_s: float
     end_s: float
     what: str
-    """`scanner`: it is unplugged; `left`, `right` or `boom`: the drive finds a fault at the beginning."""
+    """`scanner`: it is unplugged; `left`, `right` or `boom`: the drive finds a fault at the beginning, or no home."""
     code: int = 0x2310
     """EMCY error code: overcurrent."""
 
@@ -84,7 +86,7 @@ def task(
 ) -> dict[str, Any]:
     """Drives on a CAN interface, the scanner at the link `laser`. It records, or tells the address `station`.
 
-    Of less priority than the robot's tasks and between their releases: devices have processors of their own.
+    Of less priority than the robot's tasks and not released with them: devices have processors of their own.
     """
     blocks: dict[str, Any] = {
         "drives": {
@@ -124,7 +126,7 @@ def task(
         blocks |= _together(room)
     for name in AXES:
         blocks[name] = _pulses([(trouble, trouble.code) for trouble in plant.troubles if trouble.what == name])
-    return {"period": f"{PERIOD_MS} ms", "phase": "1 ms", "priority": priority, "overruns": 0, "blocks": blocks}
+    return {"period": f"{PERIOD_MS} ms", "phase": "1.5 ms", "priority": priority, "overruns": 0, "blocks": blocks}
 
 
 def truth(datagram: bytes) -> dict[str, Value]:

@@ -26,12 +26,18 @@ from lab.scenarios.flight import Record, records
 from lab.scenarios.virtual import PLANT, far
 from lab.wheeled import plant
 from lab.wheeled.by_wires import fleet
-from lab.wheeled.plant import BITRATE, Plant, Trouble
+from lab.wheeled.plant import BITRATE, NO_HOME, Plant, Trouble
 
 HERE = Path(__file__).parent
 DIRECTORY = subject.DIRECTORY
-CAN_BOARDS = ("-object", "can-bus,id=bus", *("-device", "kvaser_pci,canbus=bus") * 2)
+# In slots whose interrupts differ: one that they share would wake the robot's threads for the drives' board, too.
+CAN_BOARDS = (
+    "-object", "can-bus,id=bus",
+    "-device", "kvaser_pci,canbus=bus,addr=6", "-device", "kvaser_pci,canbus=bus,addr=7",
+)  # fmt: skip
 OWN, DRIVES = "can0", "can1"
+BUS_OFF, RESTARTED = 0x40, 0x100
+"""Reports of a controller: CAN_ERR_BUSOFF, CAN_ERR_RESTARTED."""
 LASER = "/dev/robot/laser"
 COMMAND_PORT = 5030
 """As drive.yml has it."""
@@ -53,14 +59,16 @@ class Course:
     commands: Sequence[tuple[float, Said | None]]
     """None: silence."""
     plant: Plant = field(default_factory=Plant)
-    events: Sequence[tuple[float, Sequence[str]]] = ()
-    """Commands that are run on the robot's computer."""
+    events: Sequence[tuple[float, Sequence[str | int]]] = ()
+    """`link`, an interface, and `down` or `up`; or `report`, a CAN interface, and what its controller reports."""
     disturbances: Sequence[tuple[float, float, str]] = ()
     """From one time to another: what `Station.disturb` of guest.py does beside the commands."""
 
 
 _OFF: Said = (0, 0, 0, False)
 _ON: Said = (0, 0, 0, True)
+BOOM_RAD = 20.0
+"""Of the spindle, by which the boom is out when its drive gets power: 32 mm."""
 COURSE = Course(
     "course", 26,
     [
@@ -68,21 +76,34 @@ COURSE = Course(
         (9, (0, 0, 0.1, True)), (9.5, (0.5, 0, 0.1, True)), (18.5, (0, 0.8, 0.1, True)), (21, (0, 0, 0.1, True)),
         (21.5, (0.5, 0, 0.1, True)), (23, None),
     ],
+    Plant(figures={"boom_begin": BOOM_RAD}),
 )  # fmt: skip
-"""Ahead, a curve, on the spot, towards the wall until it stops, away from it, and no more commands."""
+"""Ahead, a curve, on the spot, towards the wall until it stops, away from it, and no more commands.
+
+The boom searches its home meanwhile, and then goes where it is told to.
+"""
 SILENT_S = 23.0
 TOWARDS_S = (9.5, 18.5)
 _AROUND: Said = (0.3, 0.6, 0, True)
 TROUBLES = Course(
-    "troubles", 29,
+    "troubles", 36,
     [
         (0, _OFF), (3, _ON), (4, _AROUND), (16, _OFF), (16.5, _ON), (17.5, _AROUND), (24, _OFF), (24.5, _ON),
-        (25.5, _AROUND),
+        (25.5, _AROUND), (31.5, _OFF), (32, _ON), (33, _AROUND),
     ],
-    Plant(troubles=[Trouble(7, 10, "scanner"), Trouble(13, 14, "left", 0x2310)]),
-    [(20, ("ip", "link", "set", OWN, "down")), (22, ("ip", "link", "set", OWN, "up"))],
+    Plant(troubles=[Trouble(0.5, 15, "boom", NO_HOME), Trouble(7, 10, "scanner"), Trouble(13, 14, "left", 0x2310)]),
+    [
+        (20, ("link", OWN, "down")), (22, ("link", OWN, "up")),
+        (29, ("link", DRIVES, "down")), (29, ("report", OWN, BUS_OFF)),
+        (31, ("link", DRIVES, "up")), (31, ("report", OWN, RESTARTED)),
+    ],
 )  # fmt: skip
-"""Round and round; its scanner is unplugged for a while, a drive faults, the bus is lost."""
+"""Round and round; its boom finds no home, its scanner is unplugged for a while, a drive faults, its interface is set
+down, and its controller is bus-off.
+
+QEMU's controllers have no error counters, so the two reports of the last one are made by us, and the drives' interface
+is down meanwhile, as nothing passes. They reach the task by the socket of the real interface.
+"""
 
 OPERATORS = Course(
     "operators", 14, [(0, _OFF), (3, _ON), (3.5, _AROUND)],

@@ -122,6 +122,11 @@ void *testbed_input(struct fl_block *block, const char *port)
     return (void *)(uintptr_t)block->in[port_named(block->in_ports, block->in_count, port)];
 }
 
+void testbed_wire(struct fl_block *block, const char *port)
+{
+    block_wire(block, port_named(block->in_ports, block->in_count, port), testbed_input(block, port));
+}
+
 const void *testbed_output(struct fl_block *block, const char *port)
 {
     return block->out[port_named(block->out_ports, block->out_count, port)];

@@ -35,6 +35,9 @@ const void *testbed_output(struct fl_block *block, const char *port);
 #define SET(block, port, c_type, value) (*(c_type *)testbed_input(block, port) = (value))
 #define GET(block, port, c_type)        (*(const c_type *)testbed_output(block, port))
 
+/* For the block, an optional input has a wire. */
+void testbed_wire(struct fl_block *block, const char *port);
+
 /* cmocka 1.1 compares floats only. */
 #define assert_near(value, expected, tolerance) testbed_near(value, expected, tolerance, __FILE__, __LINE__)
 void testbed_near(double value, double expected, double tolerance, const char *file, int line);

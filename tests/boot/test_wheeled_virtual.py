@@ -15,10 +15,10 @@ from lab.scenarios.flight import Record
 from lab.wheeled import guest, virtual
 from lab.wheeled.by_wires import fleet
 from lab.wheeled.plant import BITRATE
-from lab.wheeled.virtual import COURSE, OPERATORS, SILENT_S, TOWARDS_S, TROUBLES, Driven
+from lab.wheeled.virtual import BOOM_RAD, COURSE, OPERATORS, SILENT_S, TOWARDS_S, TROUBLES, Driven
 
-JITTER_NS = {"drive": 100_000, "perceive": 400_000}
-"""Not yet 100 µs for `perceive`."""
+JITTER_NS = {"drive": 120_000, "perceive": 200_000}
+"""Not yet 100 µs: plant and CAN interrupts fill the guest's processor, so their interrupts fall on releases."""
 LEFT_M = (0.105, 0.2)
 """Before a wall that it runs at from 0.5 m/s: 5 cm around it and the margin of 6 cm, less the noise of a scan."""
 DEAD_MAN_S = 1.0
@@ -80,6 +80,32 @@ def test_it_is_driven_by_a_station(course: Driven) -> None:
     turned = curve[-1]["pose"][2] - curve[0]["pose"][2]
     assert turned / (course.at_s(curve[-1]) - course.at_s(curve[0])) == pytest.approx(0.3, abs=0.02)
     assert all(report["lost"] == 0 for report in reports)
+
+
+def test_the_boom_finds_its_home_while_the_robot_drives(course: Driven) -> None:
+    """It is out at first, goes to its end stop, 1 mm away from it, and then as it is told."""
+    assert course.plant[0]["position"][2] == pytest.approx(BOOM_RAD, abs=0.01)
+    (searching,) = course.told(4.5, 4.59)
+    assert not searching["boom_enabled"]
+    assert searching["left"]
+    assert searching["right"]
+    assert searching["motion"][0] > 0.3
+    assert min(record["position"][2] for record in course.between(3, 8)) < 0.01
+    assert course.told(8, 8.2)[0]["boom_enabled"]
+    assert course.plant[-1]["position"][2] == pytest.approx(2 * math.pi * (0.1 + 0.001) / 0.01, abs=0.2)
+    begin = next(record for record in course.plant if record["powered"][2])
+    end = next(report for report in course.reports if report["boom_enabled"])
+    print(f"home {course.at_s(end) - course.at_s(begin):.1f} s after its power, from {BOOM_RAD:g} rad")
+
+
+def test_a_boom_without_its_home_stays_off(troubles: Driven) -> None:
+    """And the robot drives. It is tried again when the motors are switched on again."""
+    assert said(troubles.logs["drive"], "drive 3", "home failed")
+    (report,) = troubles.told(5, 5.09)
+    assert not report["boom_enabled"]
+    assert not at_rest(troubles.between(5, 6)[-1])
+    assert not any(record["powered"][2] for record in troubles.between(4, 16))
+    assert troubles.told(19, 19.2)[0]["boom_enabled"]
 
 
 def test_it_stops_before_a_wall(course: Driven) -> None:
@@ -154,6 +180,17 @@ def test_without_its_bus_it_stops(troubles: Driven) -> None:
     assert said(troubles.logs["drive"], "can0", "down")
     assert not at_rest(troubles.between(28, 29)[-1]), "it does not go on"
     assert troubles.plant[-1]["contacts"] == 0
+
+
+def test_with_its_controller_bus_off_it_stops(troubles: Driven) -> None:
+    """By what its driver reports, and drives that hear nothing; with a restart it goes on, as after any loss.
+
+    The reports are made by us: QEMU's controllers have no error counters.
+    """
+    rests(troubles, 29, STOPS_S, 33)
+    assert said(troubles.logs["drive"], "can0", "bus-off")
+    assert not any(report["left"] or report["right"] for report in troubles.told(29.5, 31))
+    assert not at_rest(troubles.between(35, 36)[-1]), "it does not go on"
 
 
 def test_it_stops_while_a_second_operator_commands(operators: Driven) -> None:

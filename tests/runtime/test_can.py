@@ -117,6 +117,51 @@ def test_every_mode_reaches_its_target(run: Any, hub: UdpHub, mode: str, target:
     assert drive.axis is Axis.SWITCH_ON_DISABLED
 
 
+HOMING = "homing: {method}, homing_speed: 2, homing_current: 0.5, homing_offset: 0.1, homing_timeout: {limit}"
+
+
+@pytest.mark.parametrize("method", [-4, -3, 17, 35])
+def test_finds_its_home_before_it_follows_the_target(run: Any, hub: UdpHub, method: int) -> None:
+    """From where its motor is when it gets power: 1 turn from the switch and 2 from the end stops, either way."""
+    drive = Epos2(NODE)
+    drive.motor.stops, drive.motor.switches = (-2, 2), (-1, 1)
+    home = {-4: -2, -3: 2, 17: -1, 35: 0}[method] + 0.1 * 10 / 6.283185 * (1 if method != -3 else -1)
+    more = HOMING.format(method=method, limit=60)
+    if method == -3:
+        more = more.replace("homing_offset: 0.1", "homing_offset: -0.1")
+    server = Epos2Server(hub, drive)
+    with server.running(), run(drive_task("position", 0.05, more), WATCHED + ",drive.homed") as task:
+        rows = []
+        for row in task.rows():
+            rows.append(row)
+            if row["enabled"] and abs(row["position"] - 0.05) < 0.002:
+                break
+        assert all(row["homed"] for row in rows if row["enabled"])
+        with server.paused():
+            assert drive.motor.turns == pytest.approx(home + 0.05 * 10 / 6.283185, abs=0.02)
+
+
+@pytest.mark.parametrize(("fails", "said"), [(True, "bit 13"), (False, "did not find its home within 1 s")])
+def test_without_a_home_the_motor_stays_off(
+    run: Any, hub: UdpHub, capfd: pytest.CaptureFixture[str], fails: bool, said: str
+) -> None:
+    """Its switch is never reached, or it says so by itself."""
+    drive = Epos2(NODE)
+    drive.wrong.homing_error = fails
+    server = Epos2Server(hub, drive)
+    with server.running(), run(drive_task("position", 5, HOMING.format(method=17, limit=1))):
+        await_axis(server, drive, Axis.OPERATION_ENABLED)
+        await_axis(server, drive, Axis.SWITCH_ON_DISABLED)
+        told = capfd.readouterr().err
+        deadline = time.monotonic() + PATIENCE
+        while said not in told:
+            assert time.monotonic() < deadline, told
+            time.sleep(0.01)
+            told += capfd.readouterr().err
+        with server.paused():
+            assert not drive.referenced
+
+
 def test_a_refused_object_keeps_the_motor_off(run: Any, hub: UdpHub) -> None:
     drive = Epos2(NODE)
     drive.wrong.refuse[0x1603, 2] = 0x06040041

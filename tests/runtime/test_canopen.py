@@ -40,6 +40,8 @@ VARIABLES: dict[int, tuple[int, str, int | str]] = {
     0x1017: (U16, "rw", 0),
     0x2030: (I16, "rw", 0),
     0x2062: (I32, "rw", 0),
+    0x2080: (U16, "rw", 500),
+    0x2081: (I32, "rw", 0),
     0x206B: (I32, "rw", 0),
     0x6007: (I16, "rw", 1),
     0x6040: (U16, "rw", 0),
@@ -50,11 +52,14 @@ VARIABLES: dict[int, tuple[int, str, int | str]] = {
     0x606C: (I32, "ro", 0),
     0x6078: (I16, "ro", 0),
     0x607A: (I32, "rw", 0),
+    0x607C: (I32, "rw", 0),
     0x607F: (U32, "rw", 25000),
     0x6081: (U32, "rw", 1000),
     0x6083: (U32, "rw", 10000),
     0x6084: (U32, "rw", 10000),
     0x6085: (U32, "rw", 10000),
+    0x6098: (I8, "rw", 7),
+    0x609A: (U32, "rw", 1000),
     0x60FF: (I32, "rw", 0),
     0x6502: (U32, "ro", 0x65),
 }
@@ -85,6 +90,7 @@ def dictionary() -> canopen.ObjectDictionary:
         ODRecord("motor", 0x6410),
         (U16, "rw", 2000), (U16, "rw", 4000), (U8, "rw", 1), (U32, "rw", 25000), (U16, "rw", 40),
     )  # fmt: skip
+    group(ODRecord("homing speeds", 0x6099), (U32, "rw", 100), (U32, "rw", 10))
     for number in range(4):
         off = 0xC0000000 if number else 0x40000000
         identifier = 0x100 * number + NODE
@@ -280,7 +286,7 @@ def test_a_master_reads_and_writes_objects(master: canopen.BaseNode402) -> None:
     for index, (_, access, default) in VARIABLES.items():
         if access != "rw" or index in (0x6040, 0x6060):
             assert master.sdo[index].raw == default, f"{index:04X}"
-    for index in (0x1018, 0x6410):
+    for index in (0x1018, 0x6099, 0x6410):
         assert master.sdo[index][0].raw == len(list(master.sdo[index].values()))
     for number in range(4):
         for index in (0x1400, 0x1600, 0x1800, 0x1A00):
@@ -384,4 +390,31 @@ def test_a_master_moves_the_motor(
     await_that(lambda: master.state == "OPERATION ENABLED")
     master.controlword = 0x0000
     await_that(lambda: master.state == "SWITCH ON DISABLED")
+    network.sync.stop()
+
+
+@pytest.mark.parametrize(("method", "fails", "home"), [(-4, False, -2.0), (18, False, 1.5), (-4, True, None)])
+def test_a_master_sends_it_home(
+    master: canopen.BaseNode402, network: canopen.Network, server: Epos2Server, drive: Epos2,
+    method: int, fails: bool, home: float | None,
+) -> None:  # fmt: skip
+    """By python-canopen's own homing, which reads the status word as the standard has it."""
+    drive.motor.stops, drive.motor.switches = (-2.0, 3.0), (-1.5, 1.5)
+    drive.wrong.homing_error = fails
+    master.nmt.state = "PRE-OPERATIONAL"
+    master.tpdo.read()
+    master.tpdo[1].trans_type = 1
+    master.tpdo[1].save()
+    network.sync.start(0.01)
+    master.setup_402_state_machine()
+    for index, value in ((0x6098, method), (0x609A, 5000), (0x607C, 100), (0x2081, 7)):
+        master.sdo[index].raw = value
+    master.sdo[0x6099][1].raw = 200
+    master.nmt.state = "OPERATIONAL"
+    assert master.homing(PATIENCE) is not fails
+    assert bool(master.sdo[0x6041].raw & 0x8000) is not fails
+    if home is not None:
+        assert abs(master.sdo[0x6064].raw - 7) < 10
+        with server.paused():
+            assert drive.motor.turns == pytest.approx(home + 100 / 2000, abs=0.1)
     network.sync.stop()

@@ -32,7 +32,7 @@ command, hub, network, udp_can = (
 LEFT, BOOM = 1, 3
 RPM = 60 / 6.283185307179586 * 43
 """Of a motor, for a rad/s of its gear's output."""
-WATCHED = "drives.enable,robot.speed,robot.position"
+WATCHED = "drives.enable,robot.speed,robot.position,error.out"
 
 
 @pytest.fixture
@@ -126,6 +126,36 @@ def test_a_master_positions_the_boom(run: Any, network: canopen.Network, on_the_
         await_that(lambda: abs(drive.sdo[0x6064].raw - 86000) < 20)
 
 
+def test_a_master_sends_the_boom_home(run: Any, network: canopen.Network, on_the_bus: None) -> None:
+    """From 10 rad, which the drive takes for 0 when it gets power: to its end stop, and a turn of the motor back."""
+    with run(Plant(figures={"boom_begin": 10})) as task:
+        wait_alive(task)
+        drive = node(network, BOOM)
+        assert abs(drive.sdo[0x6064].raw) < 20
+        for index, value in ((0x6060, 6), (0x6098, -4), (0x609A, 20000), (0x2080, 1000), (0x607C, 2000)):
+            drive.sdo[index].raw = value
+        drive.sdo[0x6099][1].raw = 4000
+        enable(drive)
+        drive.sdo[0x6040].raw = 0x1F
+        await_that(lambda: drive.sdo[0x6041].raw & 0xB400 == 0x9400)
+        task.until(lambda row: row["robot.position"][2] < 0.001)
+        task.until(lambda row: abs(row["robot.position"][2] - 2000 / 13687.325) < 0.005)
+        assert abs(drive.sdo[0x6064].raw) < 50
+        drive.sdo[0x6060].raw = -1
+        drive.sdo[0x2062].raw = 86000
+        task.until(lambda row: abs(row["robot.position"][2] - 6.283185 - 2000 / 13687.325) < 0.005)
+
+
+def test_a_boom_that_finds_no_home_says_so(run: Any, network: canopen.Network, on_the_bus: None) -> None:
+    with run(Plant(troubles=[Trouble(0.1, 1000, "boom", plant.NO_HOME)])) as task:
+        task.until(lambda row: row["error.out"][2] == plant.NO_HOME)
+        drive = node(network, BOOM)
+        drive.sdo[0x6060].raw = 6
+        enable(drive)
+        drive.sdo[0x6040].raw = 0x1F
+        assert drive.sdo[0x6041].raw & 0xB400 == 0x2000
+
+
 def test_a_master_is_refused(run: Any, network: canopen.Network, on_the_bus: None) -> None:
     with run(Plant()) as task:
         wait_alive(task)
@@ -136,7 +166,8 @@ def test_a_master_is_refused(run: Any, network: canopen.Network, on_the_bus: Non
             (0x06090011, 0x1018, 9, bytes(4)),
             (0x06070010, 0x6081, 0, bytes(2)),
             (0x06090030, 0x607F, 0, (25001).to_bytes(4, "little")),
-            (0x06090030, 0x6060, 0, b"\x06"),
+            (0x06090030, 0x6060, 0, b"\x01"),
+            (0x06090030, 0x6098, 0, b"\x11"),
             (0x08000022, 0x1600, 1, (0x60400010).to_bytes(4, "little")),
         ):
             with pytest.raises(canopen.SdoAbortedError) as refused:

@@ -41,7 +41,11 @@ enum {
     CHANGE_AT_ONCE = 0x0020,
     FAULT_RESET = 0x0080,
 };
+enum { START_HOMING = 0x0010 };
 enum { SETPOINT_ACKNOWLEDGED = 0x1000 };
+/* In the mode homing. The last one stays in every mode, as long as the drive knows its position. */
+enum { TARGET_REACHED = 0x0400, HOMING_ATTAINED = 0x1000, HOMING_ERROR = 0x2000, REFERENCED = 0x8000 };
+enum { MODE_HOMING = 6 };
 
 enum axis {
     NOT_READY,
@@ -68,6 +72,7 @@ static const struct {
 static const int64_t boot_retry_ns = 1000 * MS, sdo_timeout_ns = 500 * MS, refused_retry_ns = 1000 * MS;
 static const int64_t stop_limit_ns = 2000 * MS; /* of a quick stop, before the power is taken off all the same */
 static const int64_t reset_interval_ns = 1000 * MS;
+static const int64_t search_begin_ns = 200 * MS; /* until then the status word may be that of the search before */
 static const double standstill_rpm = 5;
 
 /* --- bytes --- */
@@ -124,10 +129,27 @@ static void map_pdo(struct epos2 *drive, uint16_t index, uint32_t off, uint32_t 
     write_object(drive, index, 1, 4, on);
 }
 
+static void list_homing(struct epos2 *drive)
+{
+    const struct epos2_settings *set = &drive->settings;
+    write_object(drive, 0x6098, 0, 1, (uint8_t)set->homing_method);
+    if (set->homing_rpm) {
+        write_object(drive, 0x6099, 1, 4, set->homing_rpm);
+        write_object(drive, 0x6099, 2, 4, set->homing_rpm);
+    }
+    if (set->rpm_per_s)
+        write_object(drive, 0x609A, 0, 4, set->rpm_per_s);
+    if (set->homing_ma)
+        write_object(drive, 0x2080, 0, 2, set->homing_ma);
+    write_object(drive, 0x607C, 0, 4, (uint32_t)set->homing_offset);
+    write_object(drive, 0x2081, 0, 4, 0); /* the position there */
+}
+
 static void list_writes(struct epos2 *drive)
 {
     const struct epos2_settings *set = &drive->settings;
     const uint32_t command[] = {0x60400010, modes[set->mode].target};
+    const uint32_t command_and_mode[] = {0x60400010, modes[set->mode].target, 0x60600008};
     const uint32_t motion[] = {0x60410010, 0x606C0020, 0x60780010};
     const uint32_t mode[] = {0x60410010, 0x60610008};
     const uint32_t position[] = {0x60410010, 0x60640020};
@@ -140,7 +162,8 @@ static void list_writes(struct epos2 *drive)
     write_object(drive, 0x1401, 1, 4, RPDO_OFF + COB_RPDO2 + set->node);
     write_object(drive, 0x1402, 1, 4, RPDO_OFF + COB_RPDO3 + set->node);
     write_object(drive, 0x1800, 1, 4, PDO_OFF + COB_TPDO1 + set->node);
-    map_pdo(drive, 0x1403, RPDO_OFF + COB_RPDO4 + set->node, COB_RPDO4 + set->node, AT_ONCE, command, 2);
+    map_pdo(drive, 0x1403, RPDO_OFF + COB_RPDO4 + set->node, COB_RPDO4 + set->node, AT_ONCE,
+            set->homing_method ? command_and_mode : command, set->homing_method ? 3 : 2);
     map_pdo(drive, 0x1801, PDO_OFF + COB_TPDO2 + set->node, TPDO_ON + COB_TPDO2 + set->node, EACH_SYNC, mode, 2);
     map_pdo(drive, 0x1802, PDO_OFF + COB_TPDO3 + set->node, TPDO_ON + COB_TPDO3 + set->node, EACH_SYNC, position, 2);
     map_pdo(drive, 0x1803, PDO_OFF + COB_TPDO4 + set->node, TPDO_ON + COB_TPDO4 + set->node, EACH_SYNC, motion, 3);
@@ -156,6 +179,8 @@ static void list_writes(struct epos2 *drive)
         write_object(drive, 0x6085, 0, 4, set->stop_rpm_per_s);
     if (set->limit_ma)
         write_object(drive, 0x6410, 2, 2, set->limit_ma);
+    if (set->homing_method)
+        list_homing(drive);
     write_object(drive, 0x6007, 0, 2, 1); /* a lost connection is a fault: it stops, and stays so until reset */
     write_object(drive, 0x1017, 0, 2, (uint32_t)set->heartbeat_ms / 2);
     /* From now on it waits for our heartbeats. */
@@ -174,6 +199,7 @@ static void enter(struct epos2 *drive, enum epos2_phase phase, int64_t now_ns)
     drive->have_position = false;
     drive->stopping = false;
     drive->setpoint_state = SETPOINT_NONE;
+    drive->search_state = SEARCH_NONE;
     drive->mode_display = 0;
     drive->control_word = DISABLE_VOLTAGE;
     drive->status_before = 0x0008; /* a drive that is already in fault did not fail while we had it */
@@ -350,6 +376,17 @@ bool epos2_enabled(const struct epos2 *drive)
            drive->mode_display == modes[drive->settings.mode].mode;
 }
 
+bool epos2_homed(const struct epos2 *drive)
+{
+    return !drive->settings.homing_method || drive->status_word & REFERENCED;
+}
+
+/* Mode to be in now. */
+static int8_t wanted_mode(const struct epos2 *drive)
+{
+    return epos2_homed(drive) ? modes[drive->settings.mode].mode : MODE_HOMING;
+}
+
 static int32_t rounded(double value, double limit)
 {
     value = value > limit ? limit : value < -limit ? -limit : value;
@@ -387,6 +424,25 @@ static uint16_t profile_position_word(struct epos2 *drive, int32_t *target)
     }
     *target = drive->setpoint;
     return ENABLE_OPERATION | (drive->setpoint_state == SETPOINT_OFFERED ? NEW_SETPOINT | CHANGE_AT_ONCE : 0);
+}
+
+/* Begin a search by a rising edge, and hold the bit while it lasts, as its fall would end it. */
+static uint16_t homing_word(struct epos2 *drive, int64_t now_ns)
+{
+    if (drive->search_state == SEARCH_NONE) {
+        drive->search_state = SEARCH_BEGUN;
+        drive->search_ns = now_ns;
+        return ENABLE_OPERATION;
+    }
+    int64_t lasts_ns = now_ns - drive->search_ns;
+    bool failed = drive->status_word & HOMING_ERROR && lasts_ns > search_begin_ns;
+    if (failed || lasts_ns > drive->settings.homing_ns) {
+        drive->search_state = SEARCH_FAILED;
+        drive->armed = false;
+        drive->trouble = (struct epos2_trouble){.cause = EPOS2_NOT_HOMED, .code = failed ? 0 : 1};
+        return QUICK_STOP;
+    }
+    return ENABLE_OPERATION | START_HOMING;
 }
 
 static uint16_t stop_word(struct epos2 *drive, enum axis axis, int64_t now_ns)
@@ -440,7 +496,11 @@ static bool is_armed(struct epos2 *drive, bool enable)
     drive->was_enabled = enable;
     drive->armed = enable && (drive->armed || edge);
     drive->reset_wanted = enable && (drive->reset_wanted || edge);
-    return drive->armed || (enable && drive->settings.automatic_restart);
+    if (edge || (!enable && drive->search_state != SEARCH_FAILED))
+        drive->search_state = SEARCH_NONE;
+    if (drive->search_state == SEARCH_FAILED)
+        drive->armed = false;
+    return drive->armed || (enable && drive->settings.automatic_restart && drive->search_state != SEARCH_FAILED);
 }
 
 /* The one word that brings the axis a step nearer to what is wanted: each state is acknowledged by the status word
@@ -457,7 +517,15 @@ static uint16_t control_word(struct epos2 *drive, int64_t now_ns, bool commanded
     if (!commanded || !armed)
         return stop_word(drive, axis, now_ns);
     drive->stopping = false;
-    if (drive->mode_display != modes[drive->settings.mode].mode)
+    if (axis == OPERATION_ENABLED && !epos2_homed(drive) && drive->mode_display == MODE_HOMING)
+        return homing_word(drive, now_ns);
+    if (drive->trouble.cause == EPOS2_NOT_HOMED && epos2_homed(drive))
+        drive->trouble.cause = EPOS2_FINE;
+    if (axis == OPERATION_ENABLED && drive->settings.homing_method && drive->mode_display == MODE_HOMING)
+        return ENABLE_OPERATION; /* homed, and about to be in the other mode; it stays where it is */
+    if (axis != OPERATION_ENABLED && drive->search_state == SEARCH_BEGUN)
+        drive->search_state = SEARCH_NONE;
+    if (drive->mode_display != wanted_mode(drive))
         return SHUTDOWN;
     switch (axis) {
     case SWITCH_ON_DISABLED:
@@ -477,9 +545,12 @@ static uint16_t control_word(struct epos2 *drive, int64_t now_ns, bool commanded
 static struct can_frame command_frame(const struct epos2 *drive, uint16_t word, int32_t target)
 {
     uint8_t size = (uint8_t)((modes[drive->settings.mode].target & 0xFF) / 8);
-    struct can_frame frame = frame_of(COB_RPDO4 + drive->settings.node, (uint8_t)(2 + size));
+    bool homing = drive->settings.homing_method;
+    struct can_frame frame = frame_of(COB_RPDO4 + drive->settings.node, (uint8_t)(2 + size + homing));
     put(frame.data, 2, word);
     put(frame.data + 2, size, (uint32_t)target);
+    if (homing)
+        frame.data[2 + size] = (uint8_t)wanted_mode(drive);
     return frame;
 }
 
@@ -541,7 +612,8 @@ static size_t run(struct epos2 *drive, int64_t now_ns, const struct epos2_comman
         uint16_t word = control_word(drive, now_ns, commanded, armed, &target);
         drive->control_word = word;
         drive->status_before = drive->status_word;
-        bool operating = (word & ENABLE_OPERATION) == ENABLE_OPERATION;
+        bool follows = drive->mode_display == modes[drive->settings.mode].mode;
+        bool operating = (word & ENABLE_OPERATION) == ENABLE_OPERATION && follows;
         out[count++] = command_frame(drive, word, operating ? target : idle_target(drive));
     }
     return count;

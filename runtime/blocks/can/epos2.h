@@ -12,6 +12,10 @@
  * operation by itself, this takes another such edge while the drive is there. Only before the first contact does an
  * edge wait for the drive.
  *
+ * With a homing method, a drive that does not say that its position is referenced searches its home in the mode of that
+ * name, each time before it follows the target, and only while `enable` is on. A search that fails, or takes too long,
+ * switches the motor off until `enable` goes from 0 to 1.
+ *
  * Sources: CiA 301 4.2, CiA 402-2; Maxon, EPOS2 Firmware Specification, and the EDS of the drive for its defaults.
  */
 #ifndef FLOTILLA_EPOS2_H
@@ -32,9 +36,14 @@ struct epos2_settings {
     double counts_per_rad;   /* of the encoder, at the gear's output */
     double rpm_per_rad_s;    /* of the motor, for the gear's output */
     uint32_t max_rpm;        /* profile velocity; 0 here and below: what the drive has stored */
-    uint32_t rpm_per_s;      /* profile acceleration and deceleration */
+    uint32_t rpm_per_s;      /* acceleration and deceleration of profiles, and of homing */
     uint32_t stop_rpm_per_s; /* deceleration of a quick stop */
     uint16_t limit_ma;       /* output current */
+    int8_t homing_method;    /* object 6098; 0: none */
+    uint32_t homing_rpm;     /* of the search; 0 here and below: what the drive has stored */
+    uint16_t homing_ma;      /* by which an end stop is felt */
+    int32_t homing_offset;   /* counts from where the search ends to the position 0 */
+    int64_t homing_ns;       /* longest search */
     bool automatic_reset;    /* of faults, once a second; otherwise only by switching `enable` on again */
     bool automatic_restart;  /* restart of the motor, as soon as the drive can; otherwise only by `enable`, too */
 };
@@ -63,6 +72,7 @@ enum epos2_cause {
     EPOS2_NO_HEARTBEAT, /* it worked, and fell silent */
     EPOS2_ABORTED,      /* it refused an object: `code` is the abort code */
     EPOS2_EMERGENCY,    /* `code` is the error code of its EMCY message */
+    EPOS2_NOT_HOMED,    /* the search for its home: `code` is 0, it says that it failed, or 1, it takes too long */
 };
 
 struct epos2_trouble {
@@ -73,7 +83,7 @@ struct epos2_trouble {
 };
 
 enum {
-    EPOS2_WRITES = 56, /* SDOs of a configuration, at most */
+    EPOS2_WRITES = 64, /* SDOs of a configuration, at most */
     EPOS2_FRAMES = 4,  /* frames of one call, at most */
 };
 
@@ -102,6 +112,8 @@ struct epos2 {
     int32_t counts;
     enum { SETPOINT_NONE, SETPOINT_OFFERED, SETPOINT_TAKEN } setpoint_state; /* of profile position */
     int32_t setpoint;
+    enum { SEARCH_NONE, SEARCH_BEGUN, SEARCH_FAILED } search_state;
+    int64_t search_ns; /* its begin */
 
     /* What is known of the drive. */
     uint16_t status_word;
@@ -139,6 +151,9 @@ size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAME
 
 /* Write the last frames: power off, and no monitoring of our heartbeats any more. */
 size_t epos2_shutdown(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
+
+/* The position is that from the home, or no homing is asked for. */
+bool epos2_homed(const struct epos2 *drive);
 
 /* The drive follows the target: it is enabled and says that it is in the mode asked for. */
 bool epos2_enabled(const struct epos2 *drive);

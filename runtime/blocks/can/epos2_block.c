@@ -14,7 +14,9 @@
  * operation, silent for longer than `heartbeat`, or has sent no values for `timeout`, and while the interface is
  * missing or down. While the flag is 0 the values stay the last good ones, and `age` grows. After a fault, or after
  * the drive or the bus was lost, the motor stays off until `enable` goes from 0 to 1, or comes back by itself with
- * `restart: automatic`. The journal says the first cause.
+ * `restart: automatic`. The journal says the first cause. With `homing`, `enabled` is 0 until the drive has found its
+ * home. A search that fails or exceeds `homing_timeout` switches the motor off until `enable` goes from 0 to 1,
+ * whatever `restart` is, and the journal names it.
  */
 #include "epos2.h"
 #include "epos2_text.h"
@@ -30,6 +32,8 @@ struct epos2_block {
     int mode;
     double counts, gear, heartbeat, max_velocity, acceleration, stop_deceleration, max_current, timeout;
     int fault_reset, restart, sync;
+    int64_t homing;
+    double homing_speed, homing_current, homing_offset, homing_timeout;
 };
 
 struct state {
@@ -64,7 +68,7 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct epos2_block, max_velocity, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s",
                  .summary = "limit of velocity targets and profiles; 0 leaves what the drive has stored"),
     FL_PARAMETER(struct epos2_block, acceleration, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
-                 .summary = "of profiles, both ways; 0 leaves what the drive has stored"),
+                 .summary = "of profiles, both ways, and of homing; 0 leaves what the drive has stored"),
     FL_PARAMETER(struct epos2_block, stop_deceleration, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
                  .summary = "of a quick stop; 0 leaves what the drive has stored"),
     FL_PARAMETER(struct epos2_block, max_current, .default_value = "0", .min = 0, .max = 32.767, .unit = "A",
@@ -79,6 +83,19 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct epos2_block, sync, .default_value = "shared", .choices = "shared|none",
                  .summary = "who sends SYNC: one of the blocks on the interface with `shared`, whatever tasks of this "
                             "computer they are in, once in its period; or another computer on the bus"),
+    FL_PARAMETER(struct epos2_block, homing, .default_value = "0", .min = -4, .max = 35,
+                 .summary = "method by which the drive searches its home before it follows the target, unless it says "
+                            "that it has one, object 6098: -4 and -3 an end stop by its current, at negative and "
+                            "positive speed, 17 and 18 a limit switch there, 35 where it is; 0 for none"),
+    FL_PARAMETER(struct epos2_block, homing_speed, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s",
+                 .summary = "of the search; 0 leaves what the drive has stored"),
+    FL_PARAMETER(struct epos2_block, homing_current, .default_value = "0", .min = 0, .max = 32.767, .unit = "A",
+                 .summary = "by which an end stop is felt; 0 leaves what the drive has stored"),
+    FL_PARAMETER(struct epos2_block, homing_offset, .default_value = "0", .min = -1e6, .max = 1e6, .unit = "rad",
+                 .summary = "from the end of the search, where the drive then goes, and the position is 0; an end stop "
+                            "needs some"),
+    FL_PARAMETER(struct epos2_block, homing_timeout, .default_value = "30", .min = 0.5, .max = 3600, .unit = "s",
+                 .summary = "of the search"),
 };
 
 enum { TARGET, ENABLE, COMMAND_AGE };
@@ -94,7 +111,7 @@ static const struct fl_port inputs[] = {
          "is constant"},
 };
 
-enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, FLAG };
+enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, HOMED, FLAG };
 static const struct fl_port outputs[] = {
     {.name = "position", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "of the gear's output"},
     {.name = "velocity", .type = FL_DOUBLE, .width = 1, .unit = "rad/s", .summary = "of the gear's output"},
@@ -106,6 +123,10 @@ static const struct fl_port outputs[] = {
      .width = 1,
      .summary = "SDO abort code with which the drive refused its configuration; 0: it did not"},
     {.name = "enabled", .type = FL_BOOLEAN, .width = 1, .summary = "1: the motor follows the target"},
+    {.name = "homed",
+     .type = FL_BOOLEAN,
+     .width = 1,
+     .summary = "1: the position is that from the home, or `homing` is 0"},
     FL_SENSOR_OUTPUTS,
 };
 
@@ -128,6 +149,12 @@ static struct epos2_settings settings_of(const struct epos2_block *set)
         .rpm_per_s = whole(set->acceleration * rpm, UINT32_MAX),
         .stop_rpm_per_s = whole(set->stop_deceleration * rpm, UINT32_MAX),
         .limit_ma = (uint16_t)lround(set->max_current * 1e3),
+        .homing_method = (int8_t)set->homing,
+        .homing_rpm = whole(set->homing_speed * rpm, INT32_MAX),
+        .homing_ma = (uint16_t)lround(set->homing_current * 1e3),
+        .homing_offset =
+            (int32_t)lround(fmax(-2e9, fmin(2e9, set->homing_offset * set->counts * set->gear * RPM / 60))),
+        .homing_ns = llround(set->homing_timeout * 1e9),
         .automatic_reset = set->fault_reset == 1,
         .automatic_restart = set->restart == 1,
     };
@@ -167,6 +194,14 @@ static void log_trouble(struct fl_block *block, const struct epos2_trouble *trou
     case EPOS2_EMERGENCY:
         fl_log(block, "drive %d has a fault: EMCY error code %04X, %s", node, (unsigned)trouble->code,
                epos2_error_text((uint16_t)trouble->code));
+        break;
+    case EPOS2_NOT_HOMED:
+        fl_log(block,
+               trouble->code ? "drive %d did not find its home within %g s: check its switch or end stop; the motor "
+                               "stays off until `enable` goes from 0 to 1"
+                             : "drive %d says that its search for the home failed, status bit 13: check its switch or "
+                               "end stop; the motor stays off until `enable` goes from 0 to 1",
+               node, set->homing_timeout);
         break;
     case EPOS2_FINE:
     default:
@@ -250,6 +285,7 @@ static void show(struct fl_block *block, struct state *state)
     FL_OUT(block, ERROR, uint16_t) = drive->error_code;
     FL_OUT(block, ABORT, uint32_t) = drive->abort_code;
     FL_OUT(block, ENABLED, uint8_t) = FL_OUT(block, FLAG, bool) && epos2_enabled(drive);
+    FL_OUT(block, HOMED, bool) = drive->status_known && epos2_homed(drive);
 }
 
 /* A drive that could not be reached may be in any state, so set it up again. */

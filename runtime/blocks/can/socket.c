@@ -156,7 +156,8 @@ int can_start(struct fl_block *block, struct can_socket *can, const char *interf
     can->filter_count = count;
     can->logged = UNKNOWN;
     update(can); /* one that is there is used from the first step on */
-    can->driver = fl_driver_start(block, run, can);
+    /* It is in no hurry, and at a priority of its task's it would hold up every task of less. */
+    can->driver = fl_driver_start_ordinary(block, run, can);
     return can->driver ? FL_OK : FL_FAILED;
 }
 

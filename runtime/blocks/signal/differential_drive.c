@@ -170,8 +170,13 @@ FL_BLOCK(differential_odometry) = {
  * between two steps. The first good angles are where it begins.
  *
  * Equations:
- *   wheels' speeds: what the angles changed by since the step before, in the time since then
+ *   wheels' speeds: what the angles changed by since the last step that took them, in the time since then
  *   all else as differential-odometry
+ *
+ * A step takes the angles when both are new by their sequences, so a drive whose answer comes a step late does not look
+ * as if it stood still, and then ran twice as fast. Until then `v` and `omega` stay the last ones, and the pose waits
+ * for the angles that have the motion. Without the sequences angles are new in each step. Where answers begin to stay a
+ * step late, or one is lost for good, the speeds of one step are wrong by up to a factor of two.
  *
  * Failure: While the flag is 0, or an angle is not finite, `v` and `omega` are 0 and the pose stays; the next good
  * angles are a new beginning. Angles that changed faster than `fastest` are one, too: an encoder that counts from zero
@@ -183,6 +188,8 @@ struct encoders {
 
 struct angles {
     double left, right;
+    uint32_t left_sequence, right_sequence;
+    double since; /* s, from the step that took them */
     bool known, begun;
 };
 
@@ -192,12 +199,18 @@ static const struct fl_parameter encoder_parameters[] = {
                  .summary = "that a wheel can turn: a faster change of its angle is none of the robot's motion"),
 };
 
-enum { GOOD = RESET, ENCODER_RESET };
+enum { GOOD = RESET, ENCODER_RESET, LEFT_SEQUENCE, RIGHT_SEQUENCE };
 static const struct fl_port encoder_inputs[] = {
     {.name = "left", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "angle of the wheel"},
     {.name = "right", .type = FL_DOUBLE, .width = 1, .unit = "rad", .summary = "angle of the wheel"},
     {.name = "flag", .type = FL_BOOLEAN, .width = 1, .summary = "1: both angles are good"},
     {.name = "reset", .type = FL_BOOLEAN, .width = 1, .flags = FL_OPTIONAL, .summary = "1: back to the pose at start"},
+    {.name = "left_sequence",
+     .type = FL_UINT32,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "changes with each measurement of the angle"},
+    {.name = "right_sequence", .type = FL_UINT32, .width = 1, .flags = FL_OPTIONAL, .summary = "likewise"},
 };
 
 enum { LOST = HEADING + 1 };
@@ -219,27 +232,50 @@ static int initialize_encoders(struct fl_block *block)
     return FL_OK;
 }
 
+static bool is_new(const struct fl_block *block, uint32_t input, uint32_t before)
+{
+    return !fl_wired(block, input) || FL_IN(block, input, uint32_t) != before;
+}
+
+/* Both angles were measured again, and time has passed. */
+static bool come(const struct fl_block *block, const struct angles *before)
+{
+    return before->since > 0 && is_new(block, LEFT_SEQUENCE, before->left_sequence) &&
+           is_new(block, RIGHT_SEQUENCE, before->right_sequence);
+}
+
+/* Begin at these angles. */
+static void begin(const struct fl_block *block, struct angles *angles)
+{
+    *angles = (struct angles){.left = FL_IN(block, LEFT, double),
+                              .right = FL_IN(block, RIGHT, double),
+                              .left_sequence = FL_IN(block, LEFT_SEQUENCE, uint32_t),
+                              .right_sequence = FL_IN(block, RIGHT_SEQUENCE, uint32_t),
+                              .known = true,
+                              .begun = true};
+}
+
 static int step_encoders(struct fl_block *block)
 {
     const struct encoders *set = block->parameters;
     struct angles *angles = block->state, before = *angles;
-    double left = FL_IN(block, LEFT, double), right = FL_IN(block, RIGHT, double), h = fl_interval_s(block);
-    double fast = fmax(fabs(left - before.left), fabs(right - before.right));
+    double left = FL_IN(block, LEFT, double) - before.left, right = FL_IN(block, RIGHT, double) - before.right;
+    double h = before.since = angles->since += fl_interval_s(block);
     bool good = FL_IN(block, GOOD, uint8_t) && isfinite(left) && isfinite(right);
-    bool moved = good && before.known && fast <= set->fastest * h && h > 0;
-    if (good && before.begun && !moved && (!before.known || h > 0))
+    bool taken = good && (!before.known || come(block, &before));
+    bool moved = taken && before.known && fmax(fabs(left), fabs(right)) <= set->fastest * h;
+    if (taken && before.begun && !moved)
         FL_OUT(block, LOST, uint32_t)++;
-    if (good && (h > 0 || !before.known))
-        *angles = (struct angles){left, right, true, true};
+    if (taken)
+        begin(block, angles);
     else if (!good)
         angles->known = false;
     if (FL_IN(block, ENCODER_RESET, uint8_t))
         place(block, set->x, set->y, set->heading);
     else if (moved)
-        roll(block, set->radius * (right - before.right + left - before.left) / (2 * h),
-             set->radius * (right - before.right - left + before.left) / (set->track * h), h);
-    else
-        roll(block, 0, 0, h);
+        roll(block, set->radius * (right + left) / (2 * h), set->radius * (right - left) / (set->track * h), h);
+    else if (taken || !good)
+        roll(block, 0, 0, 0);
     return FL_OK;
 }
 

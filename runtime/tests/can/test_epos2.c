@@ -20,8 +20,8 @@ struct stub {
     size_t sent_count;
     uint32_t objects[1024]; /* of the SDOs: index << 8 | sub, and value, in turn */
     size_t object_count;
-    uint32_t refuse; /* the object that it aborts */
-    uint16_t control, words[64], status;
+    uint32_t refuse;                           /* the object that it aborts */
+    uint16_t control, words[64], status, bits; /* bits: of the status word, beside its state */
     size_t word_count;
     int8_t mode;
     int32_t target, counts, rpm;
@@ -105,7 +105,7 @@ static void obey(struct stub *stub, uint16_t word)
 
 static void report(struct stub *stub)
 {
-    uint16_t s = stub->status;
+    uint16_t s = stub->status | stub->bits;
     uint8_t low = (uint8_t)s, high = (uint8_t)(s >> 8);
     uint32_t p = (uint32_t)stub->counts, v = (uint32_t)stub->rpm;
     uint16_t i = (uint16_t)stub->ma;
@@ -132,6 +132,8 @@ static void take(struct stub *stub, const struct can_frame *frame)
         answer_sdo(stub, frame->data);
     } else if (frame->can_id == 0x500 + NODE && stub->operational && on(stub, 0x1403)) {
         memcpy(&stub->target, frame->data + 2, 4);
+        if (frame->len == 7)
+            stub->mode = (int8_t)frame->data[6];
         obey(stub, (uint16_t)(frame->data[0] | frame->data[1] << 8));
     } else if (frame->can_id == 0x080 && stub->operational) {
         report(stub);
@@ -176,7 +178,119 @@ static struct stub *enabled(struct epos2_settings settings)
     return stub;
 }
 
+/* A drive that is to search its home by an end stop, and has begun. */
+static struct stub *searching(bool automatic_restart)
+{
+    struct epos2_settings settings = usual;
+    settings.mode = EPOS2_POSITION;
+    settings.homing_method = -4;
+    settings.homing_rpm = 200;
+    settings.homing_ma = 900;
+    settings.homing_offset = 60;
+    settings.homing_ns = 2000 * MS;
+    settings.automatic_restart = automatic_restart;
+    struct stub *stub = make(settings);
+    stub->counts = 4321;
+    stub->command = (struct epos2_command){.enable = false, .target = 5};
+    periods(stub, CONTACT);
+    assert_int_equal(stub->words[stub->word_count - 1], 0); /* not before it is enabled */
+    stub->word_count = 0;
+    stub->command.enable = true;
+    periods(stub, 10);
+    return stub;
+}
+
 /* --- tests --- */
+
+static void searches_its_home_first(void **state)
+{
+    (void)state;
+    struct stub *stub = searching(false);
+    const uint16_t way[] = {0x0006, 0x0007, 0x000F, 0x001F};
+    assert_int_equal(*object(stub, 0x609800), 0xFC);
+    assert_int_equal(*object(stub, 0x609901), 200);
+    assert_int_equal(*object(stub, 0x609902), 200);
+    assert_int_equal(*object(stub, 0x208000), 900);
+    assert_int_equal(*object(stub, 0x607C00), 60);
+    assert_int_equal(*object(stub, 0x160303), 0x60600008);
+    assert_int_equal(stub->word_count, 4);
+    assert_memory_equal(stub->words, way, sizeof way);
+    assert_int_equal(stub->mode, 6);
+    periods(stub, 50);
+    assert_int_equal(stub->words[stub->word_count - 1], 0x001F); /* as long as it takes */
+    assert_int_equal(stub->target, 4321);
+    assert_false(epos2_enabled(&stub->engine));
+    assert_false(epos2_homed(&stub->engine));
+    stub->counts = 0;
+    stub->bits = 0x9400;
+    period(stub);
+    period(stub);
+    assert_int_equal(stub->mode, -1);
+    assert_int_equal(stub->control, 0x000F);
+    assert_int_equal(stub->target, 0); /* where it is, until it says that it is in the mode */
+    stub->bits = 0x8000;
+    periods(stub, 2);
+    assert_true(epos2_enabled(&stub->engine));
+    assert_int_equal(stub->target, 500);
+    assert_int_equal(stub->engine.trouble.cause, EPOS2_FINE);
+    stub->command.enable = false;
+    periods(stub, 10);
+    stub->command.enable = true;
+    stub->word_count = 0;
+    periods(stub, 10);
+    assert_true(epos2_enabled(&stub->engine)); /* it knows its position, so it does not search again */
+    assert_int_equal(stub->words[stub->word_count - 1], 0x000F);
+    test_free(stub);
+}
+
+/* By what the drive says, or because it takes too long: the motor stays off until it is enabled anew. */
+static void stops_when_it_finds_no_home(void **state)
+{
+    (void)state;
+    for (int automatic = 0; automatic <= 1; automatic++)
+        for (uint32_t code = 0; code <= 1; code++) {
+            struct stub *stub = searching(automatic);
+            stub->bits = code ? 0 : 0x2000;
+            periods(stub, 10);
+            assert_int_equal(stub->engine.trouble.cause, EPOS2_FINE); /* that may be of the search before */
+            periods(stub, code ? 200 : 20);
+            assert_int_equal(stub->engine.trouble.cause, EPOS2_NOT_HOMED);
+            assert_int_equal(stub->engine.trouble.code, code);
+            assert_int_equal(stub->status, 0x0040);
+            periods(stub, 300);
+            assert_int_equal(stub->control, 0);
+            stub->command.enable = false;
+            periods(stub, 2);
+            stub->command.enable = true;
+            periods(stub, 10);
+            assert_int_equal(stub->control, 0x001F);
+            stub->bits = 0x9400;
+            periods(stub, 5);
+            assert_true(epos2_enabled(&stub->engine));
+            assert_int_equal(stub->engine.trouble.cause, EPOS2_FINE);
+            test_free(stub);
+        }
+}
+
+/* What is disabled, or gets no command, does not search on. */
+static void searches_only_while_it_is_enabled(void **state)
+{
+    (void)state;
+    struct stub *stub = searching(false);
+    stub->command.target = NAN;
+    periods(stub, 10);
+    assert_int_equal(stub->status, 0x0040);
+    stub->command.target = 5;
+    stub->word_count = 0;
+    periods(stub, 10);
+    const uint16_t way[] = {0x0006, 0x0007, 0x000F, 0x001F};
+    assert_memory_equal(stub->words, way, sizeof way);
+    stub->command.enable = false;
+    periods(stub, 10);
+    assert_int_equal(stub->status, 0x0040);
+    assert_int_equal(stub->engine.trouble.cause, EPOS2_FINE);
+    test_free(stub);
+}
 
 static void finds_its_way_into_operation(void **state)
 {
@@ -810,6 +924,9 @@ static void survives_any_frames(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
+        cmocka_unit_test(searches_its_home_first),
+        cmocka_unit_test(stops_when_it_finds_no_home),
+        cmocka_unit_test(searches_only_while_it_is_enabled),
         cmocka_unit_test(finds_its_way_into_operation),
         cmocka_unit_test(maps_in_the_standards_order),
         cmocka_unit_test(asks_for_nothing_unacknowledged),

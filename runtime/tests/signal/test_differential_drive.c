@@ -185,6 +185,40 @@ static void begins_anew(void **state)
     testbed_end(block);
 }
 
+/* Angles with the number of their SYNC. */
+static void measured(struct fl_block *block, double left, uint32_t left_sync, double right, uint32_t right_sync)
+{
+    SET(block, "left_sequence", uint32_t, left_sync);
+    SET(block, "right_sequence", uint32_t, right_sync);
+    turn_to(block, left, right, 1);
+}
+
+/* Drives that answer a step late now and then, both (3) or one of them: the motion is that of the wheels. */
+static void takes_angles_of_one_sync(void **state)
+{
+    (void)state;
+    struct fl_block *block = encoders();
+    const int late[] = {0, 0, 1, 0, 0, 2, 0, 3, 0, 3, 0};
+    testbed_wire(block, "left_sequence");
+    testbed_wire(block, "right_sequence");
+    measured(block, 0, 1, 0, 1);
+    for (int i = 1; i <= 1000; i++) {
+        int what = late[i % 11], left = i - (what & 1), right = i - (what >> 1);
+        measured(block, 0.02 * left, (uint32_t)left + 1, 0.04 * right, (uint32_t)right + 1);
+        if (i > 1) {
+            assert_near(GET(block, "v", double), 0.3, 1e-9);
+            assert_near(GET(block, "omega", double), 0.5, 1e-9);
+        }
+    }
+    measured(block, 20.02, 1002, 40.04, 1002);
+    assert_near(GET(block, "heading", double), 5.005, 1e-9);
+    assert_near(GET(block, "x", double), 0.6 * sin(5.005), 1e-9);
+    assert_int_equal(GET(block, "lost", uint32_t), 0);
+    turn_to(block, 20.02, 40.04, 0);
+    assert_near(GET(block, "v", double), 0, 0);
+    testbed_end(block);
+}
+
 static void refuses(void **state)
 {
     (void)state;
@@ -202,6 +236,7 @@ int main(void)
         cmocka_unit_test(keeps_its_pose_in_late_steps),
         cmocka_unit_test(counts_angles),
         cmocka_unit_test(begins_anew),
+        cmocka_unit_test(takes_angles_of_one_sync),
         cmocka_unit_test(refuses),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
