@@ -187,7 +187,7 @@ def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
 
 
 def test_a_release_whose_control_overruns_goes_back(guests: Guests, make: Make) -> None:
-    """Each step of its tasks takes longer than a period: the runtime gives them up, time and again, and their units fail.
+    """Each step of its tasks takes longer than a period: the runtime gives them up, and their units fail.
     The limit lets pass what a busy host does to guests."""
     before, boot = runs(guests), boot_of(guests, OTHER)
     lenient = json.dumps({"health": {"overruns_percent": 50}})
