@@ -109,6 +109,5 @@ def test_each_step_of_a_bad_release_overruns(staged: Staged) -> None:
 
 @pytest.mark.nightly
 def test_updates_repeat_to_the_byte(staged: Staged, fleet: Fleet, artefacts: Path) -> None:
-    """Seen to fail with a random number for the first repair symbol."""
     again = virtual.stage(fleet.boards["smartcoret3"], fleet.network.update_kbit_s, artefacts)
     assert again.said == staged.said

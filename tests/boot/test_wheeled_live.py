@@ -94,7 +94,6 @@ def wait_at_rest(there: Live) -> None:
 
 
 def test_it_goes_where_it_is_told_and_reports_it(there: Live, operator: Operator) -> None:
-    """Seen to fail with a plant on another bus, where no motor gets power."""
     operator.say(0.3, 0)
     there.until(lambda: there.truth()["pose"][0] > 0.5, PATIENCE_S, "it goes ahead")
     operator.say(0, 0.5)
@@ -108,7 +107,6 @@ def test_it_goes_where_it_is_told_and_reports_it(there: Live, operator: Operator
 
 
 def test_without_commands_it_stops_and_goes_on_with_the_next(there: Live, operator: Operator) -> None:
-    """Seen to fail where the operator went on to command."""
     operator.say(0, 0.5)
     there.until(lambda: there.truth()["motion"][1] > 0.4, PATIENCE_S, "it turns")
     operator.silence()
@@ -122,7 +120,6 @@ def test_without_commands_it_stops_and_goes_on_with_the_next(there: Live, operat
 
 
 def test_it_stops_before_the_wall_that_its_scanner_sees(there: Live, operator: Operator) -> None:
-    """Seen to fail in a room without walls."""
     before = there.truth()["scans"]
     operator.say(0.5, 0)
     there.until(lambda: there.report()["limited"], PATIENCE_S, "it sees the wall")
