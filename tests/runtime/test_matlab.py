@@ -134,8 +134,7 @@ import-model deploy:
 \t@test -z '$(ZIP)' || cp '$(ZIP)' imported.zip
 """
 """The station computer's Makefile: what it is asked, and the archive."""
-SSH = """\
-#!/bin/sh
+SSH = """#!/bin/sh
 # Runs on this computer what ssh would run there: as there, one string for a shell. `scp` copies to the home directory.
 echo "$0" "$@" >>"$HOME/../argv"
 [ "$1" != -V ] || exit ${BROKEN:-0}
