@@ -17,8 +17,8 @@ from lab.wheeled.by_wires import fleet
 from lab.wheeled.plant import BITRATE
 from lab.wheeled.virtual import BOOM_RAD, COURSE, OPERATORS, SILENT_S, TOWARDS_S, TROUBLES, Driven
 
-JITTER_NS = {"drive": 120_000, "perceive": 200_000}
-"""Not yet 100 µs: plant and CAN interrupts fill the guest's processor, so their interrupts fall on releases."""
+JITTER_NS = 60_000
+"""Of either task. Seen to fail with 8 ns an instruction, where plant and robot want more than the whole processor."""
 LEFT_M = (0.105, 0.2)
 """Before a wall that it runs at from 0.5 m/s: 5 cm around it and the margin of 6 cm, less the noise of a scan."""
 DEAD_MAN_S = 1.0
@@ -82,6 +82,15 @@ def test_it_is_driven_by_a_station(course: Driven) -> None:
     assert all(report["lost"] == 0 for report in reports)
 
 
+def test_it_reports_the_motion_that_it_has(course: Driven) -> None:
+    """In a curve, from the positions of two drives whose answers come apart; `obstacle-stop` goes by it."""
+    reported = [report["motion"] for report in course.told(7, 7.9)]
+    print(f"reported in the curve: {reported}")
+    assert len(reported) == 9
+    for motion in reported:
+        assert motion == pytest.approx((0.3, 0.3), rel=0.1)
+
+
 def test_the_boom_finds_its_home_while_the_robot_drives(course: Driven) -> None:
     """It is out at first, goes to its end stop, 1 mm away from it, and then as it is told."""
     assert course.plant[0]["position"][2] == pytest.approx(BOOM_RAD, abs=0.01)
@@ -134,7 +143,7 @@ def test_steps_are_on_time(driven: dict[str, Driven], task: str) -> None:
         found = each.statistics[task]
         print(f"{name}: {task}: jitter {found['jitter']['max_ns'] / 1e3} µs, step {found['step']['max_ns'] / 1e3} µs")
         assert found["overruns"] == 0
-        assert found["jitter"]["max_ns"] < JITTER_NS[task]
+        assert found["jitter"]["max_ns"] < JITTER_NS
 
 
 def busiest(records: Sequence[Record]) -> float:
