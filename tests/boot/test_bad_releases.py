@@ -26,6 +26,11 @@ ROBOT = 4
 BACK_S = 15 * 60
 """Of the robot's time: from power on with the bad release until the former one has started, and says so."""
 TRIAL_S = 10 * 60
+DAY_S = 24 * 60 * 60
+"""Where virtual time may jump to: while the watchdog resets an idle guest, only the battery clock's own timer is due,
+at midnight."""
+WATCHDOG_S = 30
+"""Until it bites after it was fed last; the IB700 has no more."""
 SECONDS = 900
 """Of the host's, for either start."""
 STARTED = r"Reached target .*multi-user"
@@ -80,11 +85,16 @@ def test_the_former_release_is_back_by_itself(
         guest.on()
         if sign:
             guest.console.expect(sign, SECONDS)
+        seen = qemu.virtual_s(guest.execute)
         if bites:
             guest.wait_event("WATCHDOG", SECONDS)
         tried = qemu.virtual_s(guest.execute)
         guest.console.expect(STARTED, SECONDS)
         taken = qemu.virtual_s(guest.execute)
+        if taken > DAY_S:
+            assert bites, taken
+            tried = seen + WATCHDOG_S
+            taken = tried + taken % DAY_S
         guest.cut()
         after, overlay = tmp_path / "after", guest.directory / "card.qcow2"
         subprocess.run([qemu.find_tool("qemu-img"), "convert", "-O", "raw", str(overlay), str(after)], check=True)
