@@ -83,10 +83,12 @@ def test_a_standby_sends_too_and_triggers_nothing(published: Fleet) -> None:
 
 
 def test_where_stations_alone_listen_each_report_is_judged() -> None:
-    """The wheeled robot's: ten a second."""
+    """The wheeled robot's: ten a second of its driving, two of what it sees."""
     described = traffic.describe(inventory.load_fleet(paths.PROJECT / "lab" / "wheeled" / "inventory"))
-    assert [(chain.name, chain.period_ns) for chain in described.chains] == [("drive-report", 100_000_000)]
-    assert load.run(described, B, 1, 2).chains["drive-report"].sent == 20
+    periods_ns = {"drive-report": 100_000_000, "perceive-report": 500_000_000}
+    assert {chain.name: chain.period_ns for chain in described.chains} == periods_ns
+    chains = load.run(described, B, 1, 2).chains
+    assert {name: chains[name].sent for name in periods_ns} == {"drive-report": 20, "perceive-report": 4}
 
 
 def test_a_fleet_that_sends_nothing_has_no_answer() -> None:

@@ -169,14 +169,14 @@ FL_BLOCK(differential_odometry) = {
  * Computes motion and pose of a robot from the angles of its two driven wheels on one axle, so that no motion is lost
  * between two steps. The first good angles are where it begins.
  *
- * Equations:
- *   wheels' speeds: what the angles changed by since the last step that took them, in the time since then
- *   all else as differential-odometry
- *
  * A step takes the angles when both are new by their sequences, so a drive whose answer comes a step late does not look
  * as if it stood still, and then ran twice as fast. Until then `v` and `omega` stay the last ones, and the pose waits
  * for the angles that have the motion. Without the sequences angles are new in each step. Where answers begin to stay a
  * step late, or one is lost for good, the speeds of one step are wrong by up to a factor of two.
+ *
+ * Equations:
+ *   wheels' speeds: what the angles changed by since the last step that took them, in the time since then
+ *   all else as differential-odometry
  *
  * Failure: While the flag is 0, or an angle is not finite, `v` and `omega` are 0 and the pose stays; the next good
  * angles are a new beginning. Angles that changed faster than `fastest` are one, too: an encoder that counts from zero
