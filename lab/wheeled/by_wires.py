@@ -28,8 +28,8 @@ INVENTORY = Path(__file__).parent / "inventory"
 PERIOD_S = 0.01
 SLOWER = 10
 """Steps of `drive` in one of `perceive`."""
-SCAN_AGE_S = 0.07
-"""Of a scan when its last point is measured."""
+SCAN_AGE_S = 0.1
+"""Of a scan when `perceive` takes it: a turn of the scanner after its first point."""
 _REMOVED = {
     "perceive": ("laser", "to_drive"),
     "drive": ("clearance", "report", "to_station", *AXES),

@@ -50,7 +50,8 @@ class Robot:
     """By a thread of its own: takes commands, and reports unless it is to be silent."""
 
     def __init__(self, fleet: Path) -> None:
-        (self._stream,) = telemetry.streams(inventory.load_fleet(fleet))
+        streams = telemetry.streams(inventory.load_fleet(fleet))
+        (self._stream,) = (stream for stream in streams if stream.task == "drive")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((ROBOT, 5030))
         self.commands: list[Sent] = []

@@ -145,7 +145,7 @@ def test_it_sees_another_robot_and_runs_into_it(plant: Plant) -> None:
     without radius."""
     radius, scanner = FIGURES["body_radius"], FIGURES["scanner_x"]
     there = {"others": [3, 0.1, 0], "walls": BOX}
-    scan = plant(12, [0, 0, 0], **there)[-1]["millimetres"]
+    scan = plant(20, [0, 0, 0], **there)[-1]["millimetres"]
     assert scan[384 - 44] == pytest.approx(1e3 * (3 - scanner - math.sqrt(radius**2 - 0.1**2)), abs=0.51)
     aside = math.atan2(0.1, 3 - scanner) + math.asin(radius / math.hypot(0.1, 3 - scanner))
     step = 384 - 44 + math.floor(aside * 1024 / math.tau)
@@ -157,7 +157,7 @@ def test_it_sees_another_robot_and_runs_into_it(plant: Plant) -> None:
 
 
 def test_a_robot_that_is_not_there_is_not_seen(plant: Plant) -> None:
-    scan = plant(12, [0, 0, 0], others=[3, 0, 0], there=False, walls=BOX)[-1]["millimetres"]
+    scan = plant(20, [0, 0, 0], others=[3, 0, 0], there=False, walls=BOX)[-1]["millimetres"]
     assert scan[384 - 44] == 4000 - 150
 
 
