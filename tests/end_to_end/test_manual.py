@@ -106,6 +106,28 @@ ELSEWHERE = {
         ),
         "needs recordings; unit/test_convert.py and unit/test_report_of_files.py make the like",
     ),
+    "make import-model ZIP=hover_ctrl.zip NAME=hover": "needs an archive; runtime/test_imported.py makes one",
+    **dict.fromkeys(
+        (
+            "make station",
+            "make station INVENTORY=build/wheeled/station KEYS=build/wheeled/keys",
+            "make station REPLAY=build/recordings/2026-05-04T10-30-00.mcap",
+        ),
+        "serves until Ctrl-C; test_station_page.py in runtime and boot",
+    ),
+    "ssh -L 8080:127.0.0.1:8080 station": "needs a second computer",
+    **dict.fromkeys(
+        ("make drive ROBOT=5", "make drive ROBOT=1 INVENTORY=build/wheeled/station"),
+        "needs a robot on wheels; runtime/test_drive.py has one by datagrams",
+    ),
+    **dict.fromkeys(
+        (
+            "make wheeled N=1 ROOM=corner",
+            "make top INVENTORY=build/wheeled/station",
+            "make record INVENTORY=build/wheeled/station",
+        ),
+        "runs until Ctrl-C; boot/test_wheeled_live.py boots the same",
+    ),
     "make deploy ROBOT=3 APP=apps/hover": "runs until Ctrl-C; test_deploy.py",
     "make deploy ROBOT=3 APP=apps/hover RUN=status": "needs the robot; test_deploy.py asks a guest",
     "make deploy ROBOT=3 APP=apps/hover ON_ROBOT=1": "needs the robot; test_deploy.py compiles on a guest",

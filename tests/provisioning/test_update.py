@@ -186,6 +186,7 @@ def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
     assert f"changed: [{OTHER}]" not in done.said.partition("Robots start it")[2]
 
 
+@pytest.mark.nightly
 def test_a_release_whose_control_overruns_goes_back(guests: Guests, make: Make) -> None:
     """Each step of its tasks takes longer than a period: the runtime gives them up, and their units fail.
     The limit lets pass what a busy host does to guests."""
