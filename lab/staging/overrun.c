@@ -1,5 +1,6 @@
 /* A library in a release whose control tasks overrun. The release loads it into every program; those that sleep until a
- * moment as real-time threads, which control tasks do before each step, are busy for more than a period afterwards. */
+ * moment as real-time threads, which control tasks do before each step, are busy for more than a period after every
+ * second one: the runtime gives a task up that overruns again and again without a step on time between. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <sched.h>
@@ -14,7 +15,8 @@ __attribute__((visibility("default"))) int clock_nanosleep(clockid_t clock, int 
 {
     if (syscall(SYS_clock_nanosleep, clock, flags, until, left) < 0)
         return errno;
-    if (!(flags & TIMER_ABSTIME) || sched_getscheduler(0) != SCHED_FIFO)
+    static _Thread_local unsigned sleeps;
+    if (!(flags & TIMER_ABSTIME) || sched_getscheduler(0) != SCHED_FIFO || ++sleeps % 2)
         return 0;
     struct timespec begin, now;
     clock_gettime(CLOCK_MONOTONIC, &begin);

@@ -78,7 +78,8 @@ def test_gate_catches_a_fault_and_names_it(
     print(said)
     assert f"{scenario}: wake-up: " in said
     before, after = (each.scenarios[scenario].latencies["wake-up"].max_us for each in (measured("lean"), found))
-    assert after > max(2 * before, late_us)
+    # Where in a delay a timer falls due is chance: it is late by nearly all of the longest that it meets.
+    assert after > max(2 * before, 0.9 * late_us)
     for words in named:
         assert words in said
 

@@ -7,6 +7,7 @@ does, is in tests/boot/test_bad_releases.py, by the robot's own time.
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -186,16 +187,15 @@ def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
     assert f"changed: [{OTHER}]" not in done.said.partition("Robots start it")[2]
 
 
-@pytest.mark.nightly
 def test_a_release_whose_control_overruns_goes_back(guests: Guests, make: Make) -> None:
-    """Each step of its tasks takes longer than a period: the runtime gives them up, and their units fail.
-    The limit lets pass what a busy host does to guests."""
+    """Every second step of its tasks takes longer than a period, which no unit notices. The limit lets pass what a busy
+    host does to guests."""
     before, boot = runs(guests), boot_of(guests, OTHER)
-    lenient = json.dumps({"health": {"overruns_percent": 50}})
+    lenient = json.dumps({"health": {"overruns_percent": 25}})
     done = update(guests, make(6, "overruns"), *STOP, "-e", lenient)
     assert done.status != 0
     assert f"{NAME} goes back to its release: {NAME} does not do well" in done.said, done.said
-    assert "failed ['flotilla-task@heading.service']" in done.said, done.said
+    assert re.search(r"heading: \d+ of the last \d+ steps overran, more than 25 %", done.said), done.said
     now = state(guests)
     assert (runs(guests), now["trial"]) == (before, None)
     other = state(guests, OTHER)
