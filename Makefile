@@ -48,8 +48,8 @@ size: | setup ## the largest packages and files of a robot's image
 
 ##@ Fleet
 .PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave
-fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4
-	$(Q)$(FLOTILLA) fleet up $(call need,N)
+fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4 [LINK=ibss]
+	$(Q)$(FLOTILLA) fleet up $(call need,N) $(call option,--link,LINK)
 
 fleet-status: | setup-tests ## what the guests of the virtual fleet do
 	$(Q)$(FLOTILLA) fleet status
@@ -293,8 +293,8 @@ latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control
 boot-time: | setup-tests ## where a boot spends its time, in virtual time
 	$(Q)$(FLOTILLA) boot-time $(measured)
 
-scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests | ROBOTS=16]
-	$(Q)$(FLOTILLA) scenarios $(if $(filter guests,$(ON)),--guests) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
+scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ROBOTS=16]
+	$(Q)$(FLOTILLA) scenarios $(if $(filter guests,$(ON)),--guests) $(call option,--link,LINK) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
 
 scenarios-accept: | setup-tests ## make a new run the accepted one: commit lab/scenarios/baseline.json
 	$(Q)$(FLOTILLA) scenarios-accept

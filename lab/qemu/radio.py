@@ -17,13 +17,14 @@ import socket
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from flotilla.common import paths
 from lab.qemu.qemu import Wire
 
-_TCP = 6
+_TCP, _UDP = 6, 17
 _GROUPS = b"\x01\x00\x5e"
 """What hardware addresses of IPv4's groups begin with."""
 
@@ -38,6 +39,13 @@ for words in (f"address add {address}/24 dev radio0", "link set lo up", "link se
 socket.send_fds(sink, [b"x"], [tap])
 sink.recv(1)
 """
+
+
+def _udp_ports(frame: bytes) -> tuple[int, int]:
+    """From and to; 0 and 0 in other frames. IPv4 without options, and never in fragments."""
+    if frame[12:14] != b"\x08\x00" or frame[23] != _UDP:
+        return 0, 0
+    return int.from_bytes(frame[34:36]), int.from_bytes(frame[36:38])
 
 
 class Node:
@@ -112,8 +120,8 @@ class Radio:
         self.deaf: set[str] = set()
         """Members that no multicast over IPv4 reaches; all else does."""
         self.lost = self.carried = self.overrun = 0
-        self.lossy_bytes = 0
-        """Bytes of all frames that may be lost, from the Ethernet header on."""
+        self._lossy_bytes: Counter[tuple[int, int]] = Counter()
+        """Of frames that may be lost, from the Ethernet header on, by UDP ports; 0 and 0 is all else."""
         self.on_frame = threading.Condition()
         """Notified after each frame."""
         self._ends, self._end = os.pipe()
@@ -131,6 +139,10 @@ class Radio:
             cable.socket.close()
         for node in self.nodes.values():
             node.close()
+
+    def lossy_bytes(self, port: int) -> int:
+        """Bytes of all frames from or to a UDP port, from the Ethernet header on."""
+        return sum(count for ports, count in self._lossy_bytes.items() if port in ports)
 
     def wait_for_frames(self, sender: str, count: int) -> None:
         """Wait until a node sent so many frames."""
@@ -158,7 +170,8 @@ class Radio:
         receivers: Collection[str] = self._ends_of if place is None else (place,)
         to_a_group = frame[:3] == _GROUPS
         repeated = frame[12:14] == b"\x08\x00" and frame[23] == _TCP
-        self.lossy_bytes += 0 if repeated else len(frame)
+        if not repeated:
+            self._lossy_bytes[_udp_ports(frame)] += len(frame)
         for receiver in receivers:
             if receiver == sender:
                 continue

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from ipaddress import IPv4Address
 from pathlib import Path
 
-from flotilla.fleet.model import Fleet, Network
+from flotilla.fleet.model import Fleet, Network, Robot
 from lab.qemu import qemu
 from lab.qemu.process import Emulator
 
@@ -24,17 +24,21 @@ class Segment:
 
     def __init__(
         self, network: Network, robots: Iterable[IPv4Address], station: IPv4Address, directory: Path,
-        datagrams: Collection[tuple[IPv4Address, int]] = (), outward: bool = True,
+        datagrams: Collection[tuple[IPv4Address, int]] = (), outward: bool = True, trunk: bool = False,
     ) -> None:  # fmt: skip
         """`station`: the address under which the host appears on the segment.
 
         `datagrams`: robots' UDP ports to which the host is to send, to each by its `udp_port()`; then what robots send
         to the station comes to the host's loopback ports. Without `outward` it does not.
+
+        `trunk`: one cable leads to all robots, such as the one into a radio cell.
         """
         directory.mkdir(parents=True, exist_ok=True)
         robots = list(robots)
-        ports = iter(free_udp_ports(2 * len(robots) + len(datagrams)))
-        self._links = {robot: qemu.Wire(next(ports), next(ports)) for robot in robots}
+        ends = 1 if trunk else len(robots)
+        ports = iter(free_udp_ports(2 * ends + len(datagrams)))
+        self._wires = [qemu.Wire(next(ports), next(ports)) for _ in range(ends)]
+        self._links = dict(zip(robots, self._wires * (len(robots) if trunk else 1), strict=True))
         self._udp = dict(zip(datagrams, ports, strict=True))
         user = qemu.user_netdev("user", network.subnet, station, dict.fromkeys(robots, 0), self._udp, outward)
         self._emulator = Emulator(lambda qmp: self._command_line(user, qmp), directory)
@@ -47,8 +51,12 @@ class Segment:
         self.close()
 
     def link(self, robot: IPv4Address) -> qemu.Wire:
-        """The robot's end of its cable."""
+        """The robot's end of its cable, or of the trunk."""
         return self._links[robot]
+
+    def options(self, robot: Robot) -> qemu.Options:
+        """The robot's computer with its cable."""
+        return qemu.Options(name=robot.name, mac=qemu.robot_mac(robot.number), link=self.link(robot.address))
 
     def ssh_port(self, robot: IPv4Address) -> int:
         """The loopback port that leads to a robot's SSH."""
@@ -66,7 +74,7 @@ class Segment:
         argv += ["-machine", "none", "-display", "none"]
         argv += ["-chardev", qemu.chardev("qmp", qmp), "-mon", "chardev=qmp,mode=control"]
         netdevs = {"user": user}
-        for number, wire in enumerate(self._links.values()):
+        for number, wire in enumerate(self._wires):
             netdevs[f"wire{number}"] = qemu.wire_netdev(f"wire{number}", wire.other_end)
         for name, netdev in netdevs.items():
             argv += ["-netdev", netdev, "-netdev", f"hubport,id=hub-{name},hubid=0,netdev={name}"]

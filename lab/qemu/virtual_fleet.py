@@ -10,12 +10,14 @@ import argparse
 import concurrent.futures
 import functools
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -26,16 +28,19 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet, Health, Robot
 from flotilla.robot import ssh
-from images.builder.build import image_of
-from lab.qemu import holder, qemu
+from images.builder.build import build, image_of
+from lab.qemu import holder
 from lab.qemu.guest import Guest
-from lab.qemu.segment import Segment, station_address
+from lab.qemu.radio_segment import segment_of
+from lab.qemu.segment import Segment
 from lab.qemu.ssh import Ssh
 from lab.qemu.timing import LabError
 
 DIRECTORY = paths.BUILD / "fleet"
 GUESTS = paths.GUESTS
 """An inventory to put behind the real one: where the guests are. There while the fleet is."""
+INVENTORY = DIRECTORY / "inventory"
+"""The fleet's description where `LINK=` is not the project's."""
 _LOCK = DIRECTORY / "lock"
 """Locked by the process that holds the fleet, whose number stands in it: without the lock, all here is left behind."""
 _LOG = DIRECTORY / "log"
@@ -63,32 +68,41 @@ def guests_inventory(ports: Mapping[str, int]) -> str:
     return yaml.safe_dump({"guests": {"hosts": {name: {**each, "ansible_port": port} for name, port in ports.items()}}})
 
 
+def with_link(link: str, directory: Path) -> Path:
+    """The project's inventory as `directory`, but with another `network.link`, which check-fleet's rules accept."""
+    shutil.copytree(paths.INVENTORY, directory)
+    file = directory / "group_vars/all.yml"
+    text, count = re.subn(r"(?m)^(  link: ).*$", rf"\g<1>{link}", file.read_text())
+    assert count == 1, f"{file} has {count} lines that say network.link"
+    file.write_text(text)
+    return directory
+
+
 @contextmanager
 def running(
-    fleet: Fleet, robots: Sequence[Robot], directory: Path, ports: Mapping[str, Mapping[str, str]] | None = None
-) -> Iterator[tuple[dict[str, Guest], Segment]]:
+    fleet: Fleet, robots: Sequence[Robot], directory: Path, ports: Mapping[str, Mapping[str, str]] | None = None,
+    images: Path = paths.IMAGES,
+) -> Iterator[tuple[dict[str, Guest], Segment]]:  # fmt: skip
     """The robots as guests on one segment with the station, switched on, by name; not yet booted.
 
     `ports`: by the robot's name, its `qemu.Options.ports`.
     """
     with ExitStack() as stack:
-        addresses = [robot.address for robot in robots]
-        segment = Segment(fleet.network, addresses, station_address(fleet), directory / "segment")
-        stack.enter_context(segment)
+        segment = stack.enter_context(segment_of(fleet, robots, directory / "segment"))
         guests = {}
         for robot in robots:
-            options = qemu.Options(
-                name=robot.name, mac=qemu.robot_mac(robot.number), link=segment.link(robot.address),
-                ports=(ports or {}).get(robot.name, {}),
-            )  # fmt: skip
-            guest = Guest(fleet.boards[robot.board], image_of(robot), directory / robot.name, options)
+            options = replace(segment.options(robot), ports=(ports or {}).get(robot.name, {}))
+            guest = Guest(fleet.boards[robot.board], image_of(robot, images), directory / robot.name, options)
             guests[robot.name] = stack.enter_context(guest)
             guest.on()
         yield guests, segment
 
 
-def up(count: int) -> None:
-    """Start the first `count` robots as guests in the background, and wait until each lets us in."""
+def up(count: int, link: str | None = None) -> None:
+    """Start the first `count` robots as guests in the background, and wait until each lets us in.
+
+    `link`: instead of the inventory's `network.link`; then guests have cards of their own.
+    """
     fleet = inventory.load_fleet()
     robots = list(fleet.robots.values())[:count]
     if not 1 <= count <= len(fleet.robots):
@@ -96,7 +110,7 @@ def up(count: int) -> None:
         raise UserError(
             f"N={count}: {where} has {len(fleet.robots)} robots; give 1 to {len(fleet.robots)}, or add some"
         )
-    for robot in robots:
+    for robot in robots if link is None else ():
         if not image_of(robot).exists():
             raise UserError(f"{paths.shown(image_of(robot))} is missing; build it: make image ROBOT={robot.number}")
     if ports := guest_ports():
@@ -105,7 +119,7 @@ def up(count: int) -> None:
         _say(ports, "runs already")
         return
     DIRECTORY.mkdir(parents=True, exist_ok=True)
-    argv = [sys.executable, "-m", "flotilla", "fleet", "hold", str(count)]
+    argv = [sys.executable, "-m", "flotilla", "fleet", "hold", str(count), *([f"--link={link}"] if link else [])]
     progress.command(argv)
     with progress.step(f"boot {count} guests") as step, _LOG.open("w") as log:
         process = subprocess.Popen(
@@ -123,7 +137,8 @@ def up(count: int) -> None:
         except BaseException:
             process.terminate()
             raise
-    _say(guest_ports(), f"runs on {fleet.network.subnet}")
+    how = f" by {link}" if link else ""
+    _say(guest_ports(), f"runs on {fleet.network.subnet}{how}")
 
 
 def status() -> str:
@@ -162,7 +177,7 @@ def down() -> str:
     return ended if ran else "no virtual fleet runs"
 
 
-def hold(count: int) -> None:
+def hold(count: int, link: str | None = None) -> None:
     """Be the process in the background, until SIGTERM: a line on standard output for each robot that has booted."""
     signal.signal(signal.SIGTERM, _end)
     lock = _free_lock()
@@ -173,9 +188,13 @@ def hold(count: int) -> None:
         GUESTS.unlink(missing_ok=True)
         for directory in filter(Path.is_dir, DIRECTORY.iterdir()):
             shutil.rmtree(directory)  # a killed fleet's: its guests' overlays may be of other images
-        fleet = inventory.load_fleet()
+        fleet = inventory.load_fleet(with_link(link, INVENTORY) if link else None)
         robots = list(fleet.robots.values())[:count]
-        guests, segment = stack.enter_context(running(fleet, robots, DIRECTORY))
+        images = paths.IMAGES
+        if link:
+            images = DIRECTORY / "images"
+            build(fleet, robots, images)
+        guests, segment = stack.enter_context(running(fleet, robots, DIRECTORY, images=images))
         ports = {robot.name: segment.ssh_port(robot.address) for robot in robots}
         for robot in robots:
             guests[robot.name].console.expect(rf"{robot.name} login: ", BOOT_SECONDS)
@@ -228,10 +247,13 @@ def _free_lock() -> IO[str] | None:
 
 def _say(ports: Mapping[str, int], how: str) -> None:
     listed = ", ".join(f"{name} on port {port}" for name, port in ports.items())
-    guests = os.path.relpath(GUESTS, paths.PROJECT / "ansible")
+    guests, described = (
+        os.path.relpath(place, paths.PROJECT / "ansible")
+        for place in (GUESTS, INVENTORY if INVENTORY.exists() else paths.INVENTORY)
+    )
     sys.stderr.write(
         f"virtual fleet {how}: {listed}\n"
-        f"provision it: cd ansible && ansible-playbook -i inventory -i {guests} -l guests fleet.yml\n"
+        f"provision it: cd ansible && ansible-playbook -i {described} -i {guests} -l guests fleet.yml\n"
         "shell: make ssh ROBOT=1    state: make fleet-status    end: make fleet-down\n"
     )
 
@@ -239,6 +261,7 @@ def _say(ports: Mapping[str, int], how: str) -> None:
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", choices=("up", "status", "down", "hold"), help="hold: what `up` leaves running")
     parser.add_argument("count", type=int, nargs="?", help="of guests, for up")
+    parser.add_argument("--link", choices=("ethernet", "ibss"), help="of the guests, instead of the inventory's")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -247,9 +270,9 @@ def run(arguments: argparse.Namespace) -> None:
     try:
         match arguments.what:
             case "up":
-                up(arguments.count)
+                up(arguments.count, arguments.link)
             case "hold":
-                hold(arguments.count)
+                hold(arguments.count, arguments.link)
             case "status":
                 print(status())
             case "down":

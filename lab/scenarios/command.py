@@ -68,14 +68,14 @@ def _fly(names: list[str], side_m: float, board: Board) -> None:
         raise UserError("\n".join(faults))
 
 
-def _fly_guests(names: list[str], side_m: float, board: Board) -> None:
+def _fly_guests(names: list[str], side_m: float, board: Board, link: str) -> None:
     there = {plan.name: plan for plan in plans(side_m) if plan.name in guests.FLIGHTS}
     if others := [name for name in chosen(names, there) if name not in there]:
         raise UserError(f"{', '.join(others)}: guests fly {', '.join(there)}; all else is for virtual time")
     shutil.rmtree(GUESTS, ignore_errors=True)
     to_fly = [there[name] for name in chosen(names, there)]
-    flown = {plan.title: guests.fly(plan, GUESTS / plan.name, board) for plan in to_fly}
-    page = report.write(flown, paths.BUILD / "reports", "flights", guests.HOW)
+    flown = {plan.title: guests.fly(plan, GUESTS / plan.name, board, link) for plan in to_fly}
+    page = report.write(flown, paths.BUILD / "reports", "flights", guests.HOW[link])
     print(f"{paths.shown(page)}; consoles of the guests: {paths.shown(GUESTS)}")
 
 
@@ -113,6 +113,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help=f"of the square (%(default)s m; as published, {SIDE_M:g})",
     )
     parser.add_argument("--guests", action="store_true", help="in real time, by guests of the card images")
+    parser.add_argument(
+        "--link",
+        choices=tuple(guests.HOW),
+        default="ethernet",
+        help="of guests (%(default)s); in virtual time it is ibss",
+    )
     parser.add_argument("--robots", type=int, metavar="N", help="instead, latency and loss with up to so many robots")
     parser.add_argument("--board", help="of the computers, a name in the inventory (the scenario's own)")
 
@@ -123,4 +129,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.robots is not None:
         crowds(arguments.robots, _board(arguments.board))
     else:
-        (_fly_guests if arguments.guests else _fly)(arguments.flights, arguments.side, _board(arguments.board))
+        board = _board(arguments.board)
+        if arguments.guests:
+            _fly_guests(arguments.flights, arguments.side, board, arguments.link)
+        else:
+            _fly(arguments.flights, arguments.side, board)

@@ -1,4 +1,4 @@
-"""Flights in real time: the fleet's four computers as guests of their card images, on one Ethernet segment.
+"""Flights in real time: the fleet's four computers as guests of their card images, on one Ethernet segment or the air.
 
 This computer is the rest of the test lab: the robot that floats, its gyro on the guest's serial port, its valves at
 the relay board's I/O ports, positions to the robot and reports from it by UDP. How fast that goes depends on the host;
@@ -29,6 +29,7 @@ from lab.emulators.serial_line import SerialLine, UnixSocket
 from lab.plants.plant import THRUSTERS, Plant
 from lab.qemu import qemu
 from lab.qemu.guest import Guest
+from lab.qemu.radio_segment import segment_of
 from lab.qemu.relay_ports import RelayPorts
 from lab.qemu.segment import Segment
 from lab.qemu.ssh import Ssh
@@ -37,10 +38,14 @@ from lab.scenarios import virtual
 from lab.scenarios.flight import Flight, Record
 from lab.scenarios.virtual import Plan
 
-HOW = (
-    "Each is a guest of its card image, all on one Ethernet segment, in real time on this computer, whose speed the "
-    "latencies show. The robot's own clock measures them."
-)
+HOW = {
+    link: f"Each is a guest of its card image, {where}, in real time on this computer, whose speed the latencies show. "
+    "The robot's own clock measures them."
+    for link, where in {
+        "ethernet": "all on one Ethernet segment",
+        "ibss": "with an emulated 802.11 adapter, all in one ad hoc cell",
+    }.items()
+}
 FLIGHTS = ("udp", "dds")
 """Undisturbed, by each transport: the names of the plans that guests fly."""
 PERIOD_NS = 10_000_000
@@ -115,9 +120,10 @@ class GuestFleet:
 
     def __init__(
         self, described: Fleet, robot: FloatingRobot, igps: Igps, machines: Mapping[str, Guest],
-        shells: Mapping[str, Ssh],
+        shells: Mapping[str, Ssh], segment: Segment,
     ) -> None:  # fmt: skip
         self.fleet, self.robot, self.machines, self.shells = described, robot, machines, shells
+        self.segment = segment
         self._igps = igps
         self._records: dict[str, list[Record]] = {}
         streams = [replace(stream, address=LOOPBACK) for stream in telemetry.streams(described)]
@@ -207,18 +213,18 @@ class GuestFleet:
                     shell.run(["sudo", "systemctl", "restart", f"flotilla-task@{name}"], timeout=BOOT_SECONDS)
 
 
-def fleet(transport: str, board: Board | None = None) -> Fleet:
-    """The scenarios' fleet with wired ports, which QEMU can connect, and our kernel, which boots fastest."""
+def fleet(transport: str, board: Board | None = None, link: str = "ethernet") -> Fleet:
+    """The scenarios' fleet by wired ports or adapters, and our kernel, which boots fastest."""
     described = virtual.fleet(transport, board=board)
-    network = described.network.model_copy(update={"link": "ethernet", "ibss": None})
+    network = described.network.model_copy(update={"link": link})
     boards = {name: board.model_copy(update={"kernel": "lean"}) for name, board in described.boards.items()}
     return described.model_copy(update={"network": network, "boards": boards})
 
 
 @contextmanager
-def guest_fleet(plan: Plan, out: Path, board: Board | None = None) -> Iterator[GuestFleet]:
+def guest_fleet(plan: Plan, out: Path, board: Board | None = None, link: str = "ethernet") -> Iterator[GuestFleet]:
     """All booted, with the plan's parameters; the robot is held until `begin`."""
-    described = fleet(plan.transport, board)
+    described = fleet(plan.transport, board, link)
     robots = list(described.robots.values())
     flying = described.robot_with("valves")
     robot = FloatingRobot()
@@ -226,20 +232,15 @@ def guest_fleet(plan: Plan, out: Path, board: Board | None = None) -> Iterator[G
         stack.enter_context(mock.patch.object(paths, "KEYS", out / "keys"))
         build.build(described, robots, out / "images")
         receiver = (flying.address, IGPS_PORT)
-        segment = stack.enter_context(
-            Segment(
-                described.network, [one.address for one in robots], described.stations[0].address, out / "segment",
-                [receiver],
-            )
-        )  # fmt: skip
+        segment = stack.enter_context(segment_of(described, robots, out / "segment", [receiver]))
         relays = stack.enter_context(RelayPorts(robot.board))
         gyro = out / "gyro.socket"
         machines, shells = {}, {}
         for one in robots:
-            options = qemu.Options(name=one.name, mac=qemu.robot_mac(one.number), link=segment.link(one.address))
+            options = segment.options(one)
             if one is flying:
                 ports = {one.devices["gyro"].port: qemu.unix_socket(gyro)}
-                options = replace(options, extra=relays.arguments, ports=ports)
+                options = replace(options, extra=(*options.extra, *relays.arguments), ports=ports)
             image = build.image_of(one, out / "images")
             machines[one.name] = stack.enter_context(Guest(described.boards[one.board], image, out / one.name, options))
             port = functools.partial(segment.ssh_port, one.address)
@@ -248,7 +249,7 @@ def guest_fleet(plan: Plan, out: Path, board: Board | None = None) -> Iterator[G
         stack.enter_context(SerialLine(Dsp3000(robot.gyro_deg_s, noise=0), UnixSocket(str(gyro))))
         there = (LOOPBACK, segment.udp_port(*receiver))
         igps = stack.enter_context(Igps(there, robot.position, rate=100, faults=Faults(loss=1)))
-        lab = GuestFleet(described, robot, igps, machines, shells)
+        lab = GuestFleet(described, robot, igps, machines, shells, segment)
         stack.callback(lab.close)
         with progress.step(f"boot {len(robots)} guests") as step:
             for machine in machines.values():
@@ -264,9 +265,9 @@ def guest_fleet(plan: Plan, out: Path, board: Board | None = None) -> Iterator[G
         yield lab
 
 
-def fly(plan: Plan, out: Path, board: Board | None = None) -> Flight:
+def fly(plan: Plan, out: Path, board: Board | None = None, link: str = "ethernet") -> Flight:
     """The plan's square, undisturbed."""
-    with guest_fleet(plan, out, board) as lab:
+    with guest_fleet(plan, out, board, link) as lab:
         lab.begin()
         with progress.step(f"{plan.seconds:g} s of flight") as step:
 

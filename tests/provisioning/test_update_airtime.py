@@ -184,13 +184,13 @@ def test_robots_get_a_delta_at_once(cell: Cell, record_property: Callable[[str, 
     size = release.delta_of(*blobs).stat().st_size
     names = [robot.name for robot in cell.fleet.robots.values()]
     before = {name: cell.steps(name) for name in names}
-    sent = cell.radio.lossy_bytes
+    sent = cell.radio.lossy_bytes(multicast.PORT)
     play = cell.start(new)
     cell.wait_for_symbols(NEW_BYTES // 2 // multicast.SYMBOL)
     status = "cat /proc/$(systemctl show -P MainPID flotilla-receive)/status; chrt -p $(pidof flotilla-receive)"
     receiver = cell.sudo(names[0], status)
     said = cell.said(play)
-    sent = cell.radio.lossy_bytes - sent
+    sent = cell.radio.lossy_bytes(multicast.PORT) - sent
     print(f"receiver: {receiver}; {cell.radio.overrun} frames had no room")
     record_property(PROPERTY, f"{len(names)} robots: {sent} bytes sent for {size}, {sent / size:.3f} times as many")
     assert f"{len(names)} of {len(names)} robots have it" in said
@@ -225,7 +225,7 @@ def test_what_is_cut_off_goes_on(cell: Cell) -> None:
     new = cell.release(moved=False)
     first, second = cell.machines
     before = {name: cell.steps(name) for name in cell.machines}
-    sent = cell.radio.lossy_bytes
+    sent = cell.radio.lossy_bytes(multicast.PORT)
     play = cell.start(new)
     cell.wait_for_symbols(NEW_BYTES // 3 // multicast.SYMBOL)
     cell.sudo(first, "systemctl kill --signal=KILL flotilla-receive")
@@ -238,15 +238,15 @@ def test_what_is_cut_off_goes_on(cell: Cell) -> None:
     assert "unreachable=1" in cell.said(play, status=4)
     block = multicast.BLOCK * multicast.SYMBOL
     # Blocks that went out when the receiver was killed may be needed once more.
-    assert cell.radio.lossy_bytes - sent <= 1.25 * (NEW_BYTES + 2 * block)
+    assert cell.radio.lossy_bytes(multicast.PORT) - sent <= 1.25 * (NEW_BYTES + 2 * block)
     staged_all_of_it(cell, first)
     no_step_is_unaccounted(before[first], cell.steps(first))
 
     cell.machines[second].on()
     wait_booted(cell, next(robot for robot in cell.fleet.robots.values() if robot.name == second))
     assert cell.sudo(second, "systemctl show --property=SubState --value flotilla-receive").strip() == "running"
-    sent = cell.radio.lossy_bytes
+    sent = cell.radio.lossy_bytes(multicast.PORT)
     said = cell.said(cell.start(new, "-e", "by=multicast"))
     assert "1 of 1 robots have it" in said
-    assert cell.radio.lossy_bytes - sent < NEW_BYTES, "it was received from the beginning"
+    assert cell.radio.lossy_bytes(multicast.PORT) - sent < NEW_BYTES, "it was received from the beginning"
     staged_all_of_it(cell, second)

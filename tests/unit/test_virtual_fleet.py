@@ -26,7 +26,9 @@ SECONDS = 60
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
-def boots_for_ever(fleet: Fleet, robots: Sequence[Robot], directory: Path, ports: object = None) -> Never:
+def boots_for_ever(
+    fleet: Fleet, robots: Sequence[Robot], directory: Path, ports: object = None, images: object = None
+) -> Never:
     """Guests, as `lab.qemu.virtual_fleet.running`: says what lay there before them, and when they end."""
     print(*sorted(path.name for path in directory.iterdir()), flush=True)
     try:

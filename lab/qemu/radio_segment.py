@@ -1,0 +1,61 @@
+"""A radio cell that guests share, and the host's way into it: `lab/qemu/segment.py` through the air."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from ipaddress import IPv4Address
+from pathlib import Path
+
+from flotilla.fleet.model import Fleet, Robot
+from lab.qemu import qemu
+from lab.qemu.air import Air
+from lab.qemu.segment import Segment, station_address
+
+STATION = "station"
+"""The member of the cell that stands for the host."""
+
+
+class RadioSegment(Segment):
+    """Give each guest its `options()`; `ssh_port()` leads to it. Guests may come and go."""
+
+    def __init__(
+        self, fleet: Fleet, robots: Sequence[Robot], station: IPv4Address, directory: Path,
+        datagrams: Collection[tuple[IPv4Address, int]] = (), loss: float = 0.0, seed: int = 1,
+    ) -> None:  # fmt: skip
+        """As `Segment`; `loss`: of each attempt of a frame, 0 to 1."""
+        ibss = fleet.network.ibss
+        assert ibss, "the fleet has no cell"
+        addresses = [robot.address for robot in robots]
+        super().__init__(fleet.network, addresses, station, directory, datagrams, trunk=True)
+        self.air = Air(loss=loss, seed=seed)
+        self._adapters = {robot.name: self.air.adapter(robot.name, adapter_mac(robot.number), seed) for robot in robots}
+        self.air.cable(STATION, self.link(addresses[0]), ibss)
+
+    def __enter__(self) -> RadioSegment:
+        self.air.__enter__()
+        return self
+
+    def close(self) -> None:
+        self.air.__exit__()
+        super().close()
+
+    def options(self, robot: Robot) -> qemu.Options:
+        """The robot's computer with the adapter; nothing is plugged into its wired port."""
+        return replace(super().options(robot), link=None, extra=self._adapters[robot.name].arguments)
+
+
+def segment_of(
+    fleet: Fleet, robots: Sequence[Robot], directory: Path, datagrams: Collection[tuple[IPv4Address, int]] = (),
+    loss: float = 0.0,
+) -> Segment:  # fmt: skip
+    """What the fleet's `network.link` connects its guests and the station with. `loss`: of frames on the air."""
+    station = station_address(fleet)
+    if fleet.network.link == "ibss":
+        return RadioSegment(fleet, robots, station, directory, datagrams, loss)
+    return Segment(fleet.network, [robot.address for robot in robots], station, directory, datagrams)
+
+
+def adapter_mac(number: int) -> str:
+    """A locally administered address of its own for each robot's adapter."""
+    return f"52:54:00:f2:{number >> 8 & 0xFF:02x}:{number & 0xFF:02x}"
