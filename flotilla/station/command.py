@@ -50,8 +50,9 @@ def run(arguments: argparse.Namespace) -> None:
             receiver.sinks.append(Recorder(known, arguments.record))
             doing.append("recording")
         if arguments.top:
-            states = Services(fleet.robots.values()).states if arguments.ask else {}
-            top = Top(receiver, states, Dialog({robot.name: robot for robot in fleet.robots.values()}))
+            services = Services(fleet.robots.values() if arguments.ask else ())
+            dialog = Dialog({robot.name: robot for robot in fleet.robots.values()})
+            top = Top(receiver, services.states, dialog, cells=services.cells)
             receiver.sinks.append(top)
             if not doing and not top.console.is_terminal:
                 seconds = seconds or TOP_S

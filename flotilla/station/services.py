@@ -1,4 +1,5 @@
-"""Whether control tasks run, and how: asked of each robot by ssh every ASK_S, over one connection that stays."""
+"""Whether control tasks run, and how, and the radio cell: asked of each robot by ssh every ASK_S, over one connection
+that stays."""
 
 from __future__ import annotations
 
@@ -18,6 +19,9 @@ from flotilla.robot import ssh
 
 ASK_S = 5
 _END = "."
+_CELL = "/run/flotilla/cell"
+"""What the robot's service `flotilla-cell@` writes."""
+_IN_THE_CELL = "in the cell"
 _PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
 _SETTINGS = ("ConnectTimeout=5", "ServerAliveInterval=5", "ServerAliveCountMax=2")
 
@@ -47,13 +51,24 @@ class State:
     """None: it does not run."""
 
 
-def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
-    """Its tasks by name, again and again, until UserError says why it does not answer any more."""
+@dataclass(frozen=True)
+class Answer:
+    """Of a robot."""
+
+    tasks: dict[str, State]
+    """By name."""
+    cell: str = ""
+    """What is to be said of its place in the ad hoc cell: how often it was lost, and why. Empty: nothing."""
+
+
+def ask(robot: Robot) -> Generator[Answer, None, None]:
+    """What it says, again and again, until UserError says why it does not answer any more."""
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
-    longest = 1 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
+    longest = 2 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
     status = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
-    script = f"while cat /proc/uptime && {show} && {{ {status}; }} && echo {_END}; do sleep {ASK_S}; done"
+    cell = f"cat {_CELL} 2>/dev/null || echo"
+    script = f"while cat /proc/uptime && {show} && {{ {status}; {cell}; }} && echo {_END}; do sleep {ASK_S}; done"
     before: dict[str, State] = {}
     program, *way = ssh.command(robot)
     options = [word for setting in _SETTINGS for word in ("-o", setting)]
@@ -69,8 +84,9 @@ def ask(robot: Robot) -> Generator[dict[str, State], None, None]:
                     lines.append(line)
                     continue
                 try:
+                    *lines, cell = lines
                     before = _states(lines[: -len(units)], lines[-len(units) :], before)
-                    yield before
+                    yield Answer(before, "" if cell.strip() == _IN_THE_CELL else cell.strip())
                 except (ValueError, KeyError, TypeError) as error:
                     raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {error!r}") from error
                 lines = []
@@ -120,6 +136,8 @@ class Services:
         asked = [robot for robot in robots if robot.control_tasks]
         self.states = {(robot.name, task): State("asked", True) for robot in asked for task in robot.control_tasks}
         """By robot and task, as they were reported last."""
+        self.cells: dict[str, str] = {}
+        """By robot, what is to be said of its place in the ad hoc cell."""
         for robot in asked:
             ssh.command(robot)
             threading.Thread(target=self._follow, args=(robot,), daemon=True).start()
@@ -127,9 +145,10 @@ class Services:
     def _follow(self, robot: Robot) -> None:
         while True:
             try:
-                for states in ask(robot):
-                    for task, state in states.items():
+                for answer in ask(robot):
+                    for task, state in answer.tasks.items():
                         self.states[robot.name, task] = state
+                    self.cells[robot.name] = answer.cell
             except UserError:
                 for task in robot.control_tasks:
                     self.states[robot.name, task] = State("no answer", False)

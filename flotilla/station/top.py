@@ -143,13 +143,16 @@ class Top:
         states: Mapping[tuple[str, str], State] = MappingProxyType({}),
         dialog: Dialog | None = None,
         clock: Callable[[], int] = time.time_ns,
+        cells: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
+        """`cells`: by robot, what is to be said of its place in the ad hoc cell."""
         self.console = Console()
         self._known = sorted(receiver.known.values(), key=lambda stream: stream.topic)
         self._receiver = receiver
         self._states = states
         self._dialog = dialog
         self._clock = clock
+        self._cells = cells
         self._stats = {stream.topic: StreamStats(stream, clock()) for stream in self._known}
         self._live: Live | None = None
 
@@ -231,9 +234,11 @@ class Top:
             table.add_row(robot, task, period, *[""] * (len(_TITLES) - 3), *_asked(state))
         if chosen is not None:
             table.rows[chosen].style = "reverse"
+        notes = [f"{robot}: radio {said}" for robot, said in sorted(self._cells.items()) if said]
         if self._receiver.strangers:
-            table.caption = f"{self._receiver.strangers} datagrams of strangers left out"
-            table.caption_justify = "left"
+            notes.append(f"{self._receiver.strangers} datagrams of strangers left out")
+        if notes:
+            table.caption, table.caption_justify = "\n".join(notes), "left"
         return table
 
 

@@ -127,6 +127,11 @@ class Ssh:
             self.connect()
         return subprocess.Popen(self._command(argv), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
+    @property
+    def command(self) -> list[str]:
+        """What goes before a command of one's own, by the shared connection."""
+        return [*self._within, "ssh", *self._options, self._host]
+
     def read(self, path: str) -> bytes:
         done = self._run(["cat", "--", path], 60, b"")
         if done.returncode:
@@ -155,7 +160,7 @@ class Ssh:
             raise Expired(f"{self._robot.name}: {shlex.join(argv)}: no end within {timeout:g} s\n{so_far}") from None
 
     def _command(self, argv: Sequence[str]) -> list[str]:
-        return [*self._within, "ssh", *self._options, self._host, shlex.join(argv)]
+        return [*self.command, shlex.join(argv)]
 
     def _try_to_connect(self, deadline: Deadline) -> str | None:
         """Start the shared connection: None when it stands, else what ssh said."""

@@ -194,6 +194,13 @@ class GuestFleet:
         """The path was commanded to its end."""
         return any(record["done"] for record in self._records.get("control", ())[-1:])
 
+    @property
+    def good_share(self) -> float:
+        """Of the last second's valve commands, those from computers that all had what they need: 0 to 1. Ask for it in
+        `until`, which hears them."""
+        last = self._records.get("valves", ())[-round(1e9 / PERIOD_NS) :]
+        return sum(record["good"] for record in last) / max(len(last), 1)
+
     def flight(self) -> Flight:
         """What came of the flight so far."""
         with self.robot.board.lock:

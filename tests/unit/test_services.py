@@ -13,7 +13,7 @@ import pytest
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
-from flotilla.station.services import State, TaskStatus, ask
+from flotilla.station.services import Answer, State, TaskStatus, ask
 
 ROBOT = Robot(
     name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"), control_tasks=["valves", "sensors"]
@@ -74,10 +74,9 @@ def test_what_services_do(robot: Path) -> None:
     """Seen to fail with restarts that do no harm, and with the boot's time for the task's."""
     say(robot, unit("valves", "active", "running", 0, 148562559), unit("sensors", "active", "running", 2, 53540000))
     with closing(ask(ROBOT)) as answers:
-        assert next(answers) == {
-            "valves": State("running 5 s", True),
-            "sensors": State("running 100 s, restarted 2×", False),
-        }
+        assert next(answers) == Answer(
+            {"valves": State("running 5 s", True), "sensors": State("running 100 s, restarted 2×", False)}
+        )
         say(robot, unit("valves", "inactive", "dead", 0, 0), unit("sensors", "activating", "auto-restart", 7, 0))
         changed = {"valves": State("dead", False), "sensors": State("auto-restart, restarted 7×", False)}
         assert until(answers, changed)
@@ -92,20 +91,35 @@ def test_what_tasks_say_of_themselves(robot: Path) -> None:
 
     tell(robot, valves=7, sensors=0)
     with closing(ask(ROBOT)) as answers:
-        first = next(answers)
+        first = next(answers).tasks
         assert (first["valves"].status, first["sensors"].status) == (status(7, 0), status(0, 0))
         tell(robot, valves=9, sensors=None)
         assert any(
-            (a["valves"].status, a["sensors"].status) == (status(9, 2), None)
+            (a.tasks["valves"].status, a.tasks["sensors"].status) == (status(9, 2), None)
             for a, _ in zip(answers, range(10000), strict=False)
         )
         tell(robot, valves=3)
-        assert any(a["valves"].status == status(3, 3) for a, _ in zip(answers, range(10000), strict=False))
+        assert any(a.tasks["valves"].status == status(3, 3) for a, _ in zip(answers, range(10000), strict=False))
 
 
-def until(answers: Iterator[dict[str, State]], wanted: dict[str, State]) -> bool:
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [("in the cell", ""), (LOST := "in the cell; joined again 2 times, last because it had left it", LOST)],
+)
+def test_what_a_robot_says_of_the_cell(robot: Path, written: str, said: str) -> None:
+    """Seen to fail with the line taken for a task's."""
+    say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
+    tell(robot, valves=7, sensors=0)
+    program(robot, "cat", f'#!/bin/sh\n[ "$*" = /proc/uptime ] && echo 153.54 93.80 || echo "{written}"\n')
+    with closing(ask(ROBOT)) as answers:
+        first = next(answers)
+    assert (first.cell, sorted(first.tasks)) == (said, ["sensors", "valves"])
+    assert first.tasks["valves"].status
+
+
+def until(answers: Iterator[Answer], wanted: dict[str, State]) -> bool:
     """One of the next answers is that: some were given before the change."""
-    return any(answer == wanted for answer, _ in zip(answers, range(10000), strict=False))
+    return any(answer.tasks == wanted for answer, _ in zip(answers, range(10000), strict=False))
 
 
 def test_one_that_does_not_answer(robot: Path) -> None:

@@ -1,0 +1,178 @@
+"""Cards with `link: ibss`: guests whose only way to each other and to the station is an emulated 802.11 adapter.
+
+The four computers of the scenarios, whose control loop goes over the air. What happens to the cell is in order; each
+test leaves all in it. `lab/qemu/air.py` says what the air is.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from flotilla.common import paths
+from flotilla.fleet.model import Robot
+from flotilla.robot import ssh
+from flotilla.station import services
+from lab.qemu import virtual_fleet
+from lab.qemu.radio_segment import RadioSegment
+from lab.qemu.timing import Deadline
+from lab.scenarios import guests, virtual
+from lab.scenarios.guests import GuestFleet
+from lab.scenarios.virtual import Plan
+
+SECONDS = 300
+"""For what takes a few on an idle host."""
+ONE = "robot2"
+"""Whose place in the cell is disturbed."""
+GOOD_SHARE = 0.1
+"""Of commands, which a busy computer makes late."""
+OTHER = "02:ca:ff:ee:10:43"
+
+
+@pytest.fixture(scope="module")
+def lab(session_artefacts: Path) -> Iterator[GuestFleet]:
+    """All booted, and the control loop goes round."""
+    plan = Plan("udp", "in the cell", 0)
+    with guests.guest_fleet(plan, session_artefacts / "radio-cell", link="ibss") as lab:
+        yield lab
+
+
+@pytest.fixture(scope="module")
+def segment(lab: GuestFleet) -> RadioSegment:
+    assert isinstance(lab.segment, RadioSegment)
+    return lab.segment
+
+
+def robots(lab: GuestFleet) -> dict[str, Robot]:
+    return {robot.name: robot for robot in lab.fleet.robots.values()}
+
+
+def sh(lab: GuestFleet, name: str, script: str, *, check: bool = True) -> str:
+    return lab.shells[name].script(script, check=check, timeout=SECONDS).stdout.strip()
+
+
+def until(lab: GuestFleet, script: str, name: str = ONE) -> None:
+    """A condition in a robot's shell. It is reached by the air, so it may not be at all for a while."""
+    deadline = Deadline(SECONDS)
+    while True:
+        lab.shells[name].connect(deadline.left)
+        if sh(lab, name, f"{script} && echo so", check=False).endswith("so"):
+            return
+        assert not deadline.expired, f"{script}: {sh(lab, name, 'cat /run/flotilla/cell; iw dev wlan0 link')}"
+
+
+def test_addresses_are_on_the_radio(lab: GuestFleet) -> None:
+    """SSH came by it already: nothing else is plugged in. Seen to fail with the card of `link: ethernet`."""
+    cell = lab.fleet.network.ibss
+    assert cell
+    for name, robot in robots(lab).items():
+        shown = json.loads(sh(lab, name, "ip -json -4 address show scope global"))
+        addresses = {one["ifname"]: [each["local"] for each in one["addr_info"]] for one in shown}
+        assert addresses == {cell.interface: [str(robot.address)]}
+        link = sh(lab, name, f"iw dev {cell.interface} link")
+        assert f"Joined IBSS {cell.bssid}" in link
+        assert f"freq: {cell.frequency_mhz}" in link
+        driver = sh(lab, name, f"basename $(readlink /sys/class/net/{cell.interface}/device/driver)")
+        assert driver == "rt73usb"
+        assert sh(lab, name, "cat /run/flotilla/cell") == "in the cell"
+
+
+def test_provisioning_over_the_air_changes_nothing(lab: GuestFleet, tmp_path: Path) -> None:
+    ports = {name: lab.segment.ssh_port(robot.address) for name, robot in robots(lab).items()}
+    there = tmp_path / "guests.yml"
+    there.write_text(virtual_fleet.guests_inventory(ports))
+    program = Path(sys.executable).with_name("ansible-playbook")
+    argv = [str(program), "-i", str(virtual.INVENTORY), "-i", str(there), "-l", "guests", "fleet.yml"]
+    environment = os.environ | {
+        "PATH": f"{program.parent}:{os.environ['PATH']}", "ANSIBLE_NOCOLOR": "1", "KEYS": str(paths.KEYS),
+        "BUILD": str(tmp_path / "build"),
+    }  # fmt: skip
+    done = subprocess.run(
+        argv, cwd=paths.PROJECT / "ansible", env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        timeout=4 * SECONDS, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((tmp_path / "build/reports/fleet.json").read_text())
+    assert {name: robot["outcome"] for name, robot in report["robots"].items()} == dict.fromkeys(ports, "up to date")
+
+
+def later(lab: GuestFleet, name: str, script: str) -> None:
+    """Run it as root after the connection that asks for it has nothing more to say."""
+    lab.shells[name].run(
+        ["sudo", "systemd-run", "--on-active=1", "--timer-property=AccuracySec=100ms", "sh", "-c", script]
+    )
+
+
+@pytest.mark.parametrize(
+    ("drift", "because"),
+    [
+        ("", "it had left it"),
+        (
+            f"iw dev wlan0 ibss join flotilla 2412 fixed-freq {OTHER}",
+            f"it was in another one, BSSID {OTHER}",
+        ),
+        ("iw dev wlan0 ibss join flotilla 2437 fixed-freq 02:ca:ff:ee:10:42", "it was on another channel, 2437 MHz"),
+    ],
+    ids=["left", "another-cell", "another-channel"],
+)
+def test_what_drifts_is_named_and_mended(lab: GuestFleet, drift: str, because: str) -> None:
+    """By the robot itself, whom nobody reaches meanwhile. Seen to fail without `flotilla-cell@`: it never came back."""
+    later(lab, ONE, f"iw dev wlan0 ibss leave; {drift}")
+    until(lab, f"grep -q 'last because {because}$' /run/flotilla/cell")
+    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+
+
+def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the test before left, as the station asks for it."""
+    shell, robot = lab.shells[ONE], robots(lab)[ONE]
+    monkeypatch.setattr(ssh, "command", lambda _: shell.command)
+    with closing(services.ask(robot)) as answers:
+        answer = next(answers)
+    assert answer.cell == "in the cell; joined again 3 times, last because it was on another channel, 2437 MHz"
+    assert answer.tasks["navigation"].good
+
+
+def test_an_adapter_may_be_pulled_and_come_back(lab: GuestFleet, segment: RadioSegment) -> None:
+    boot = sh(lab, ONE, "cat /proc/sys/kernel/random/boot_id")
+    segment.air.plug(ONE, plugged=False)
+    lab.until(lambda: lab.good_share == 0, SECONDS)
+    segment.air.plug(ONE, plugged=True)
+    until(lab, "grep -qx 'in the cell' /run/flotilla/cell")
+    assert sh(lab, ONE, "cat /proc/sys/kernel/random/boot_id") == boot
+    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+
+
+def test_missing_firmware_is_named_on_the_console(lab: GuestFleet, segment: RadioSegment) -> None:
+    """And the robot joins as soon as it is there."""
+    sh(lab, ONE, "mkdir -p /run/nothing; mount --bind /run/nothing /usr/lib/firmware")
+    there_again = "until grep -q firmware /run/flotilla/cell; do sleep 1; done; umount /usr/lib/firmware"
+    lab.shells[ONE].run(["sudo", "systemd-run", "sh", "-c", there_again])
+    segment.air.plug(ONE, plugged=False)
+    segment.air.plug(ONE, plugged=True)
+    said = rf"{ONE}: not in the cell: wlan0 does not start: firmware rt73\.bin is missing"
+    lab.machines[ONE].console.expect(said, SECONDS)
+    until(lab, "grep -qx 'in the cell' /run/flotilla/cell")
+    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+
+
+def test_a_computer_out_of_range_is_missed_until_it_is_back(lab: GuestFleet, segment: RadioSegment) -> None:
+    assert lab.robot.board.wait_relays(on=False, timeout=SECONDS)
+    segment.air.reach(ONE, reached=False)
+    lab.until(lambda: lab.good_share == 0, SECONDS)
+    segment.air.reach(ONE, reached=True)
+    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+    assert sh(lab, ONE, "cat /run/flotilla/cell") == "in the cell", "it had been in the cell, with nobody in its range"
+
+
+def test_who_joins_late_is_let_in(lab: GuestFleet) -> None:
+    lab.machines[ONE].cut()
+    lab.until(lambda: lab.good_share == 0, SECONDS)
+    lab.machines[ONE].on()
+    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
