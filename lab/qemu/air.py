@@ -37,6 +37,9 @@ _SNAP = bytes.fromhex("aaaa03000000")
 _STATION_100KBIT_S = 110
 _GROUP_100KBIT_S = 10
 _ATTEMPTS = 7
+_SLOT = "0x13"
+"""Of the USB controller: its interrupt is not that of the serial ports, with which our kernel loses it now and then, and
+asks the controller ten times a second instead."""
 _PHY = phy.Phy("802.11g", rates_bit_s=(*phy.DSSS_BIT_S, *(rate * 1_000_000 for rate in phy.OFDM_BITS)))
 
 
@@ -65,7 +68,7 @@ class Adapter:
         """Of QEMU."""
         port = self.listener.getsockname()[1]
         return (
-            "-device", "usb-ehci,id=radio-host",
+            "-device", f"usb-ehci,id=radio-host,addr={_SLOT}",
             "-chardev", f"socket,id=radio,host=127.0.0.1,port={port},nodelay=on",
             "-device", "usb-redir,chardev=radio,bus=radio-host.0",
         )  # fmt: skip

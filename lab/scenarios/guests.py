@@ -195,11 +195,11 @@ class GuestFleet:
         return any(record["done"] for record in self._records.get("control", ())[-1:])
 
     @property
-    def good_share(self) -> float:
-        """Of the last second's valve commands, those from computers that all had what they need: 0 to 1. Ask for it in
-        `until`, which hears them."""
-        last = self._records.get("valves", ())[-round(1e9 / PERIOD_NS) :]
-        return sum(record["good"] for record in last) / max(len(last), 1)
+    def round_share(self) -> float:
+        """How many of the last second's steps came all the way round, 0 to 1, by the steps that valve commands are of.
+        Ask for it in `until`, which hears them."""
+        steps = round(1e9 / PERIOD_NS)
+        return len({record["number"] for record in self._records.get("valves", ())[-steps:]}) / steps
 
     def flight(self) -> Flight:
         """What came of the flight so far."""
@@ -229,9 +229,11 @@ def fleet(transport: str, board: Board | None = None, link: str = "ethernet") ->
 
 
 @contextmanager
-def guest_fleet(plan: Plan, out: Path, board: Board | None = None, link: str = "ethernet") -> Iterator[GuestFleet]:
-    """All booted, with the plan's parameters; the robot is held until `begin`."""
-    described = fleet(plan.transport, board, link)
+def guest_fleet(
+    plan: Plan, out: Path, board: Board | None = None, link: str = "ethernet", described: Fleet | None = None
+) -> Iterator[GuestFleet]:
+    """All booted, with the plan's parameters; the robot is held until `begin`. `described`: not the scenarios'."""
+    described = described or fleet(plan.transport, board, link)
     robots = list(described.robots.values())
     flying = described.robot_with("valves")
     robot = FloatingRobot()

@@ -1,6 +1,6 @@
 """Cards with `link: ibss`: guests whose only way to each other and to the station is an emulated 802.11 adapter.
 
-The four computers of the scenarios, whose control loop goes over the air. What happens to the cell is in order; each
+Two computers, between which the scenarios' control loop goes over the air. What happens to the cell is in order; each
 test leaves all in it. `lab/qemu/air.py` says what the air is.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,8 +16,10 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+import yaml
 
 from flotilla.common import paths
+from flotilla.fleet import inventory
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 from flotilla.station import services
@@ -29,18 +32,35 @@ from lab.scenarios.virtual import Plan
 
 SECONDS = 300
 """For what takes a few on an idle host."""
+BOARD = "smartcoret3"
 ONE = "robot2"
 """Whose place in the cell is disturbed."""
-GOOD_SHARE = 0.1
-"""Of commands, which a busy computer makes late."""
+CUT_SHARE, WELL_SHARE = 0.02, 0.1
+"""Of steps that come all the way round: without a link the last one is repeated, and a busy computer loses some."""
 OTHER = "02:ca:ff:ee:10:43"
 
 
 @pytest.fixture(scope="module")
-def lab(session_artefacts: Path) -> Iterator[GuestFleet]:
+def described(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An inventory: that of the scenarios, with all that thinks on one computer, and what Ansible needs to reach it."""
+    directory = tmp_path_factory.mktemp("fleet") / "inventory"
+    shutil.copytree(virtual.INVENTORY, directory)
+    shutil.copy(paths.INVENTORY / "group_vars/robots.yml", directory / "group_vars")
+    robots = yaml.safe_load((directory / "robots.yml").read_text())
+    hosts = robots["robots"]["children"][f"board_{BOARD}"]["hosts"]
+    hosts[ONE]["control_tasks"] += hosts.pop("robot3")["control_tasks"] + hosts.pop("robot4")["control_tasks"]
+    (directory / "robots.yml").write_text(yaml.safe_dump(robots))
+    board = directory / f"group_vars/board_{BOARD}.yml"
+    board.write_text(board.read_text().replace("kernel: debian", "kernel: lean"))
+    return directory
+
+
+@pytest.fixture(scope="module")
+def lab(described: Path, session_artefacts: Path) -> Iterator[GuestFleet]:
     """All booted, and the control loop goes round."""
     plan = Plan("udp", "in the cell", 0)
-    with guests.guest_fleet(plan, session_artefacts / "radio-cell", link="ibss") as lab:
+    fleet = inventory.load_fleet(described)
+    with guests.guest_fleet(plan, session_artefacts / "radio-cell", described=fleet) as lab:
         yield lab
 
 
@@ -84,12 +104,12 @@ def test_addresses_are_on_the_radio(lab: GuestFleet) -> None:
         assert sh(lab, name, "cat /run/flotilla/cell") == "in the cell"
 
 
-def test_provisioning_over_the_air_changes_nothing(lab: GuestFleet, tmp_path: Path) -> None:
+def test_provisioning_over_the_air_changes_nothing(lab: GuestFleet, described: Path, tmp_path: Path) -> None:
     ports = {name: lab.segment.ssh_port(robot.address) for name, robot in robots(lab).items()}
     there = tmp_path / "guests.yml"
     there.write_text(virtual_fleet.guests_inventory(ports))
     program = Path(sys.executable).with_name("ansible-playbook")
-    argv = [str(program), "-i", str(virtual.INVENTORY), "-i", str(there), "-l", "guests", "fleet.yml"]
+    argv = [str(program), "-i", str(described), "-i", str(there), "-l", "guests", "fleet.yml"]
     environment = os.environ | {
         "PATH": f"{program.parent}:{os.environ['PATH']}", "ANSIBLE_NOCOLOR": "1", "KEYS": str(paths.KEYS),
         "BUILD": str(tmp_path / "build"),
@@ -126,7 +146,7 @@ def test_what_drifts_is_named_and_mended(lab: GuestFleet, drift: str, because: s
     """By the robot itself, whom nobody reaches meanwhile. Seen to fail without `flotilla-cell@`: it never came back."""
     later(lab, ONE, f"iw dev wlan0 ibss leave; {drift}")
     until(lab, f"grep -q 'last because {because}$' /run/flotilla/cell")
-    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
 
 
 def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,11 +162,11 @@ def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> 
 def test_an_adapter_may_be_pulled_and_come_back(lab: GuestFleet, segment: RadioSegment) -> None:
     boot = sh(lab, ONE, "cat /proc/sys/kernel/random/boot_id")
     segment.air.plug(ONE, plugged=False)
-    lab.until(lambda: lab.good_share == 0, SECONDS)
+    lab.until(lambda: lab.round_share < CUT_SHARE, SECONDS)
     segment.air.plug(ONE, plugged=True)
     until(lab, "grep -qx 'in the cell' /run/flotilla/cell")
     assert sh(lab, ONE, "cat /proc/sys/kernel/random/boot_id") == boot
-    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
 
 
 def test_missing_firmware_is_named_on_the_console(lab: GuestFleet, segment: RadioSegment) -> None:
@@ -159,20 +179,20 @@ def test_missing_firmware_is_named_on_the_console(lab: GuestFleet, segment: Radi
     said = rf"{ONE}: not in the cell: wlan0 does not start: firmware rt73\.bin is missing"
     lab.machines[ONE].console.expect(said, SECONDS)
     until(lab, "grep -qx 'in the cell' /run/flotilla/cell")
-    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
 
 
 def test_a_computer_out_of_range_is_missed_until_it_is_back(lab: GuestFleet, segment: RadioSegment) -> None:
     assert lab.robot.board.wait_relays(on=False, timeout=SECONDS)
     segment.air.reach(ONE, reached=False)
-    lab.until(lambda: lab.good_share == 0, SECONDS)
+    lab.until(lambda: lab.round_share < CUT_SHARE, SECONDS)
     segment.air.reach(ONE, reached=True)
-    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
     assert sh(lab, ONE, "cat /run/flotilla/cell") == "in the cell", "it had been in the cell, with nobody in its range"
 
 
 def test_who_joins_late_is_let_in(lab: GuestFleet) -> None:
     lab.machines[ONE].cut()
-    lab.until(lambda: lab.good_share == 0, SECONDS)
+    lab.until(lambda: lab.round_share < CUT_SHARE, SECONDS)
     lab.machines[ONE].on()
-    lab.until(lambda: lab.good_share > GOOD_SHARE, SECONDS)
+    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
