@@ -38,7 +38,7 @@ _STATION_100KBIT_S = 110
 _GROUP_100KBIT_S = 10
 _ATTEMPTS = 7
 _SLOT = "0x13"
-"""Of the USB controller: its interrupt is not that of the serial ports, with which our kernel loses it now and then, and
+"""Of the USB controller: its interrupt is not that of the serial ports, with which our kernel loses it now and then and
 asks the controller ten times a second instead."""
 _PHY = phy.Phy("802.11g", rates_bit_s=(*phy.DSSS_BIT_S, *(rate * 1_000_000 for rate in phy.OFDM_BITS)))
 
@@ -186,16 +186,18 @@ class Air:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the cell, whether or not it was entered."""
         self._waker.close()
-        self._thread.join()
+        if self._thread.ident:
+            self._thread.join()
         self._wake.close()
         for member in self._members.values():
-            if isinstance(member, Cable):
-                member.socket.close()
-                continue
-            member.listener.close()
-            if member.connection:
-                member.connection.close()
+            for end in [member.socket] if isinstance(member, Cable) else [member.listener, member.connection]:
+                if end:
+                    end.close()
 
     def _transmit(self, name: str, frame: Frame) -> None:
         """Queue it for the channel, with its attempts one behind the other."""

@@ -37,7 +37,7 @@ class RadioSegment(Segment):
         return self
 
     def close(self) -> None:
-        self.air.__exit__()
+        self.air.close()
         super().close()
 
     def options(self, robot: Robot) -> qemu.Options:

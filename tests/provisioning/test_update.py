@@ -213,6 +213,7 @@ def test_a_release_that_does_not_start_goes_back(guests: Guests, make: Make) -> 
     assert state(guests)["trial"] is None
 
 
+@pytest.mark.nightly  # the play does as before; the robot is tried in tests/boot/test_bad_releases.py
 def test_a_release_that_nobody_reaches_goes_back(guests: Guests, make: Make) -> None:
     """It has no driver of its network, so nobody can tell it so."""
     before = runs(guests)

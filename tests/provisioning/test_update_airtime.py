@@ -176,7 +176,8 @@ def cell(request: pytest.FixtureRequest, session_artefacts: Path) -> Iterator[Ce
         yield cell
 
 
-@pytest.mark.parametrize("cell", [2, pytest.param(8, marks=pytest.mark.nightly)], indirect=True, ids="{}-robots".format)
+@pytest.mark.nightly  # each time, eight namespaces get one by the same programs: tests/runtime/test_airtime.py
+@pytest.mark.parametrize("cell", [2, 8], indirect=True, ids="{}-robots".format)
 def test_robots_get_a_delta_at_once(cell: Cell, record_property: Callable[[str, object], None]) -> None:
     """By multicast alone, by at most 1.25 times the delta's bytes, while control tasks run."""
     new = cell.release(moved=True)
