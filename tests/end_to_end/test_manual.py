@@ -35,6 +35,7 @@ ELSEWHERE = {
     "make test": "is what runs this",
     "make rotate-key ROBOT=3": "changes the keys; test_fleet.py rotates one by the playbook",
     "make rotate-key ROBOT=3 RETIRE=1": "likewise",
+    "make fleet N=2 LINK=ibss": "operations.md starts a fleet; test_radio_cell.py has guests in a cell",
     "lsblk": "shows this computer's disks, no program of ours",
     "make flash ROBOT=3 DEV=/dev/sdX": "needs a card; into a file below, on block devices in unit/test_flash.py",
     "build/venv/bin/python -m serial.tools.miniterm /dev/ttyUSB0 115200": "needs a cable",

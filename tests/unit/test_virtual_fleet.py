@@ -141,6 +141,15 @@ def test_a_starting_fleet_says_whom_it_waits_for(
     assert lines[:3] == ["boot 2 guests: robot1: … s", "boot 2 guests: robot2: … s", "boot 2 guests: … s"]
 
 
+def test_a_fleet_may_have_another_link_than_the_inventorys(tmp_path: Path) -> None:
+    """Its description passes check-fleet's rules, and differs in nothing else."""
+    usual = inventory.load_fleet()
+    on_the_air = inventory.load_fleet(virtual.with_link("ibss", tmp_path / "inventory"))
+    assert (usual.network.link, on_the_air.network.link) == ("ethernet", "ibss")
+    network = on_the_air.network.model_copy(update={"link": "ethernet"})
+    assert on_the_air.model_copy(update={"network": network}) == usual
+
+
 if __name__ == "__main__":
     virtual.running = boots_for_ever
     virtual.hold(1)
