@@ -9,6 +9,7 @@ further. Computers whose clocks nobody has set are not compared: of latency ther
 from __future__ import annotations
 
 import functools
+import math
 import select
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -161,14 +162,14 @@ class GuestFleet:
 
     def wait_connected(self) -> None:
         """Until commands of a second's steps have come all the way round: DDS has to find its peers first."""
-        self._forget()
+        self.forget()
         steps = round(1e9 / PERIOD_NS)
         self.until(
             lambda: len({record["number"] for record in self._records.get("valves", ())[-2 * steps :]}) >= steps,
             BOOT_SECONDS,
         )
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
         """What was said so far."""
         while select.select(self._sockets, [], [], 0)[0]:
             self._hear()
@@ -185,7 +186,7 @@ class GuestFleet:
 
     def begin(self, velocity: Motion = AT_REST) -> None:
         """A flight, from where the robot is. Before the first one it gets no positions, so control waits."""
-        self._forget()
+        self.forget()
         self.robot.release(velocity)
         self._igps.faults = Faults()
 
@@ -197,9 +198,10 @@ class GuestFleet:
     @property
     def round_share(self) -> float:
         """How many of the last second's steps came all the way round, 0 to 1, by the steps that valve commands are of.
-        Ask for it in `until`, which hears them."""
+        NaN until a second was heard; ask for it in `until`, which hears them."""
         steps = round(1e9 / PERIOD_NS)
-        return len({record["number"] for record in self._records.get("valves", ())[-steps:]}) / steps
+        last = self._records.get("valves", ())[-steps:]
+        return len({record["number"] for record in last}) / steps if len(last) == steps else math.nan
 
     def flight(self) -> Flight:
         """What came of the flight so far."""

