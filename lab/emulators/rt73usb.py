@@ -28,7 +28,8 @@ _DEAF, _NOT_TO_ME = 1 << 16, 1 << 20
 _BEACONS = 1 << 20
 _START_FIRMWARE = 8
 _DESCRIPTOR = struct.Struct("<6I")
-_ACKNOWLEDGED, _TIMESTAMP, _OFDM, _SEQUENCE = 1 << 3, 1 << 4, 1 << 5, 1 << 28
+_VALID, _ACKNOWLEDGED, _TIMESTAMP, _OFDM, _SEQUENCE = 1 << 1, 1 << 3, 1 << 4, 1 << 5, 1 << 28
+_HEADER_BYTES = 24
 _CCK_100KBIT_S = {0: 10, 1: 20, 2: 55, 3: 110}
 """Rates by their code in a descriptor, without the bit of the short preamble."""
 _OFDM_100KBIT_S = {0xB: 60, 0xF: 90, 0xA: 120, 0xE: 180, 0x9: 240, 0xD: 360, 0x8: 480, 0xC: 540}
@@ -164,7 +165,7 @@ class Rt73Usb:
             return
         self._wait_for_beacon()
         descriptor = self._memory[_BEACON : _BEACON + _DESCRIPTOR.size]
-        if self._is_awake and any(descriptor):
+        if self._is_awake and descriptor[0] & _VALID:
             at = _BEACON + _DESCRIPTOR.size
             self._send(bytes(descriptor), bytes(self._memory[at : at + 0x100 - _DESCRIPTOR.size]))
 
@@ -177,8 +178,10 @@ class Rt73Usb:
     def _send(self, descriptor: bytes, content: bytes) -> None:
         word0, word1, word2, *_ = _DESCRIPTOR.unpack(descriptor)
         frame = bytearray(content[: word0 >> 16 & 0xFFF])
+        if len(frame) < _HEADER_BYTES + 8 * bool(word0 & _TIMESTAMP):
+            return
         if word0 & _TIMESTAMP:
-            struct.pack_into("<Q", frame, 24, self._time_us)
+            struct.pack_into("<Q", frame, _HEADER_BYTES, self._time_us)
         if word1 & _SEQUENCE:
             self._sequence = (self._sequence + 0x10) & 0xFFFF
             struct.pack_into("<H", frame, 22, self._sequence | frame[22] & 0xF)

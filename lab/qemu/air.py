@@ -147,6 +147,7 @@ class Air:
         self._lock = threading.RLock()
         self._wake, self._waker = socket.socketpair()
         self._thread = threading.Thread(target=self._run, daemon=True)
+        self._fault: BaseException | None = None
 
     def adapter(self, name: str, mac: str, seed: int = 1) -> Adapter:
         """For a guest, with the `arguments` of its QEMU."""
@@ -189,7 +190,7 @@ class Air:
         self.close()
 
     def close(self) -> None:
-        """End the cell, whether or not it was entered."""
+        """End the cell, whether or not it was entered; raise what ended it before."""
         self._waker.close()
         if self._thread.ident:
             self._thread.join()
@@ -198,6 +199,8 @@ class Air:
             for end in [member.socket] if isinstance(member, Cable) else [member.listener, member.connection]:
                 if end:
                     end.close()
+        if self._fault:
+            raise self._fault
 
     def _transmit(self, name: str, frame: Frame) -> None:
         """Queue it for the channel, with its attempts one behind the other."""
@@ -227,6 +230,12 @@ class Air:
                 member.hear(frame, NEAR_DBM)
 
     def _run(self) -> None:
+        try:
+            self._carry()
+        except BaseException as error:
+            self._fault = error
+
+    def _carry(self) -> None:
         with selectors.DefaultSelector() as selector:
             selector.register(self._wake, selectors.EVENT_READ)
             for member in self._members.values():

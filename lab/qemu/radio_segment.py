@@ -37,8 +37,8 @@ class RadioSegment(Segment):
         return self
 
     def close(self) -> None:
-        self.air.close()
         super().close()
+        self.air.close()
 
     def options(self, robot: Robot) -> qemu.Options:
         """The robot's computer with the adapter; nothing is plugged into its wired port."""

@@ -36,7 +36,7 @@ BOARD = "smartcoret3"
 ONE = "robot2"
 """Whose place in the cell is disturbed."""
 DISTURBED = pytest.mark.nightly
-"""Once, on a busy computer, a robot that had changed the channel was not reached for minutes, and nobody knows why."""
+"""What takes a minute or two beside the rest."""
 CUT_SHARE, WELL_SHARE = 0.02, 0.1
 """Of steps that come all the way round: without a link the last one is repeated, and a busy computer loses some."""
 OTHER = "02:ca:ff:ee:10:43"
