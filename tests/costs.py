@@ -1,4 +1,5 @@
-"""What the suite costs, by tier: tests, failures, time and processor time; a table at the end of `make test`.
+"""What the suite costs, by tier: tests, failures, time and processor time, and the files that cost most; a table at the
+end of `make test`.
 
 A pytest plugin that measures each test, and a command that measures what is no test, `python -m tests.costs run NAME
 COMMAND…`. Both append to the file that `COSTS` names, if it does; `python -m tests.costs show FILE` prints the table.
@@ -12,7 +13,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ import pytest
 from tests.tiers import TIERS
 
 PROPERTY = "processor_s"
+_DEAREST = 12
+"""Files of tests in the table: those that take most processor time."""
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _FILE = pytest.StashKey[str | None]()
 _so_far = 0.0
@@ -72,16 +75,24 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     for tier in [*dict.fromkeys(TIERS.values()), "nightly"]:
         own = [report for report in reports if tier_of(report) == tier]
         if own:
-            record(
-                config.stash[_FILE],
-                tier,
-                tests=len({report.nodeid for report in own}),
-                failed=len({report.nodeid for report in own if report.failed}),
-                seconds=sum(report.duration for report in own),
-                processor_s=sum(
-                    float(str(value)) for report in own for name, value in report.user_properties if name == PROPERTY
-                ),
-            )
+            record(config.stash[_FILE], tier, **_sums(own))
+    by_file: dict[str, list[pytest.TestReport]] = {}
+    for report in reports:
+        by_file.setdefault(report.nodeid.partition("::")[0], []).append(report)
+    for name, own in by_file.items():
+        record(config.stash[_FILE], name, **_sums(own))
+
+
+def _sums(reports: Sequence[pytest.TestReport]) -> dict[str, float]:
+    """Of tests."""
+    return {
+        "tests": len({report.nodeid for report in reports}),
+        "failed": len({report.nodeid for report in reports if report.failed}),
+        "seconds": sum(report.duration for report in reports),
+        "processor_s": sum(
+            float(str(value)) for report in reports for name, value in report.user_properties if name == PROPERTY
+        ),
+    }
 
 
 def tier_of(report: pytest.TestReport) -> str:
@@ -120,10 +131,14 @@ def table(file: Path) -> str:
         total = tiers.setdefault(row.pop("tier"), dict.fromkeys(row, 0))
         for key, value in row.items():
             total[key] += value
-    lines = [f"{'tier':<13} {'tests':>6} {'failed':>6} {'minutes':>8} {'processor':>9}"]
-    for tier, row in tiers.items():
+    files = [name for name in tiers if name.endswith(".py")]
+    dearest = sorted(files, key=lambda name: -tiers[name]["processor_s"])[:_DEAREST]
+    width = max(map(len, ["tier" + " " * 9, *dearest]))
+    lines = [f"{'tier':<{width}} {'tests':>6} {'failed':>6} {'minutes':>8} {'processor':>9}"]
+    for tier in [*(name for name in tiers if name not in files), *dearest]:
+        row = tiers[tier]
         minutes, processor = row["seconds"] / 60, row["processor_s"] / 60
-        lines.append(f"{tier:<13} {row['tests'] or '':>6} {row['failed']:>6.0f} {minutes:>8.1f} {processor:>9.1f}")
+        lines.append(f"{tier:<{width}} {row['tests'] or '':>6} {row['failed']:>6.0f} {minutes:>8.1f} {processor:>9.1f}")
     return "\n".join(lines)
 
 

@@ -26,6 +26,17 @@ def test_rows_of_a_tier_are_added_up(tmp_path: Path) -> None:
     ]
 
 
+def test_the_dearest_files_come_below(tmp_path: Path) -> None:
+    """By processor time, and no more of them than help."""
+    file = tmp_path / "costs"
+    for number in range(20):
+        costs.record(str(file), f"tests/unit/test_{number}.py", tests=1, failed=0, seconds=60, processor_s=number)
+    costs.record(str(file), "unit", tests=20, failed=0, seconds=1200, processor_s=190)
+    first, *others = [line.split()[0] for line in costs.table(file).splitlines()[1:]]
+    assert first == "unit"
+    assert others == [f"tests/unit/test_{number}.py" for number in range(19, 19 - costs._DEAREST, -1)]
+
+
 @pytest.mark.parametrize("status", [0, 3])
 def test_a_command_is_measured_whatever_comes_of_it(tmp_path: Path, status: int) -> None:
     file = tmp_path / "costs"
