@@ -6,29 +6,38 @@ test leaves all in it. `lab/qemu/air.py` says what the air is.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import yaml
 
+from flotilla.apps import assigned
 from flotilla.common import paths
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 from flotilla.station import services
+from images.builder import build
+from lab.containers import scale
 from lab.qemu import virtual_fleet
-from lab.qemu.radio_segment import RadioSegment
+from lab.qemu.guest import Guest
+from lab.qemu.radio_segment import RadioSegment, segment_of
+from lab.qemu.ssh import Ssh
 from lab.qemu.timing import Deadline
 from lab.scenarios import guests, virtual
 from lab.scenarios.guests import GuestFleet
+from lab.scenarios.plans import TESTED_SIDE_M
 from lab.scenarios.virtual import Plan
+from tests.figures import PROPERTY
 
 SECONDS = 300
 """For what takes a few on an idle host."""
@@ -39,6 +48,9 @@ DISTURBED = pytest.mark.nightly
 """What takes a minute or two beside the rest."""
 CUT_SHARE, WELL_SHARE = 0.02, 0.1
 """Of steps that come all the way round: without a link the last one is repeated, and a busy computer loses some."""
+RMS_M = 0.019
+AT_ONCE = 2
+"""Of twelve guests, those that boot at the same time."""
 OTHER = "02:ca:ff:ee:10:43"
 
 
@@ -216,3 +228,74 @@ def test_who_joins_late_is_let_in(lab: GuestFleet) -> None:
     is_cut(lab)
     lab.machines[ONE].on()
     is_well(lab)
+
+
+@DISTURBED
+@pytest.mark.parametrize("loss", [0, 0.01, 0.05, 0.1])
+def test_the_square_is_flown_with_loss(
+    lab: GuestFleet, segment: RadioSegment, loss: float, record_property: Callable[[str, object], None]
+) -> None:
+    """Of each attempt of a frame; an adapter makes several. The bound is that of test_scenarios_guests.py."""
+    lab.restart_with(virtual.square("udp", "the square", TESTED_SIDE_M))
+    segment.air.loss = loss
+    try:
+        lab.wait_connected()
+        lab.begin()
+        lab.until(lambda: lab.done, 2 * SECONDS)
+        flight = lab.flight()
+    finally:
+        segment.air.loss = 0
+    said = f"loss {loss}: {flight.lost()} of {len(flight.arrived)} steps lost, RMS {flight.error().rms_m * 1000:.1f} mm"
+    record_property(PROPERTY, f"{said}; four hops {flight.latency().percentiles_us} µs")
+    assert flight.error().rms_m <= RMS_M
+    assert flight.lost() <= 0.01 * len(flight.arrived)
+
+
+@pytest.fixture
+def twelve(tmp_path: Path) -> Path:
+    """The description of twelve robots in another subnet and on another channel: lines of an inventory, no code."""
+    directory = tmp_path / "inventory"
+    scale.describe(12, BOARD, directory)
+    robots = yaml.safe_load((directory / "robots.yml").read_text())
+    for robot in robots["robots"]["children"][f"board_{BOARD}"]["hosts"].values():
+        robot["address"] = f"172.20.7.{100 + robot['number']}"
+    robots["stations"]["hosts"] = {"desk": {"address": "172.20.7.1"}}
+    (directory / "robots.yml").write_text(yaml.safe_dump(robots))
+    file = directory / "group_vars/all.yml"
+    shared = yaml.safe_load(file.read_text())
+    cell = {"ssid": "dozen", "frequency_mhz": 2462, "bssid": "02:00:00:00:00:12", "interface": "wlan0"}
+    shared["network"] |= {"subnet": "172.20.7.0/24", "link": "ibss", "ibss": cell}
+    file.write_text(yaml.safe_dump(shared))
+    return directory
+
+
+@pytest.mark.nightly
+def test_twelve_robots_on_another_subnet_and_channel(twelve: Path, tmp_path: Path) -> None:
+    """Each reaches each other and the station. What `check-fleet` asks first, is asked first."""
+    fleet = inventory.load_fleet(twelve)
+    assigned.check(fleet, fleet.robots.values())
+    robots = list(fleet.robots.values())
+    assert len(robots) == 12
+    with ExitStack() as stack:
+        stack.enter_context(mock.patch.object(paths, "KEYS", tmp_path / "keys"))
+        build.build(fleet, robots, tmp_path / "images")
+        segment = stack.enter_context(segment_of(fleet, robots, tmp_path / "segment"))
+        machines, shells = {}, {}
+        for robot in robots:
+            image = build.image_of(robot, tmp_path / "images")
+            guest = Guest(fleet.boards[robot.board], image, tmp_path / robot.name, segment.options(robot))
+            machines[robot.name] = stack.enter_context(guest)
+            port = functools.partial(segment.ssh_port, robot.address)
+            shells[robot.name] = stack.enter_context(Ssh(robot, "127.0.0.1", port))
+        for group in zip(*[iter(robots)] * AT_ONCE, strict=True):
+            for robot in group:
+                machines[robot.name].on()
+            for robot in group:
+                machines[robot.name].console.expect(rf"{robot.name} login: ", 4 * SECONDS)
+                shells[robot.name].connect(4 * SECONDS)
+        peers = " ".join(str(one.address) for one in [*robots, *fleet.stations])
+        for robot in robots:
+            shell = shells[robot.name]
+            shell.script(f"for peer in {peers}; do ping -q -c 1 -w 60 $peer || exit; done", timeout=4 * SECONDS)
+            assert "freq: 2462" in shell.script("iw dev wlan0 link").stdout
+            assert str(robot.address) in shell.script("ip -4 address show dev wlan0").stdout
