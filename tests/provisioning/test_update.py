@@ -187,6 +187,7 @@ def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
     assert f"changed: [{OTHER}]" not in done.said.partition("Robots start it")[2]
 
 
+@pytest.mark.nightly
 def test_a_release_whose_control_overruns_goes_back(guests: Guests, make: Make) -> None:
     """Every second step of its tasks takes longer than a period, which no unit notices. The limit lets pass what a busy
     host does to guests."""
