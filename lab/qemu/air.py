@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from flotilla.fleet.model import Ibss
 from lab.emulators.rt73usb import Frame, Rt73Usb
@@ -41,15 +40,6 @@ _SLOT = "0x13"
 """Of the USB controller: its interrupt is not that of the serial ports, with which our kernel loses it now and then and
 asks the controller ten times a second instead."""
 _PHY = phy.Phy("802.11g", rates_bit_s=(*phy.DSSS_BIT_S, *(rate * 1_000_000 for rate in phy.OFDM_BITS)))
-
-
-class Member(Protocol):
-    """Who hears the air."""
-
-    name: str
-
-    def hear(self, frame: Frame, dbm: float) -> None:
-        """A frame that came well."""
 
 
 @dataclass

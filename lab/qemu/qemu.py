@@ -196,9 +196,9 @@ def port_ids(board: Board) -> dict[str, str]:
     }
 
 
-def robot_mac(number: int) -> str:
-    """A locally administered address of its own for each robot, so that guests can share a segment."""
-    return f"52:54:00:f1:{number >> 8 & 0xFF:02x}:{number & 0xFF:02x}"
+def robot_mac(number: int, *, radio: bool = False) -> str:
+    """A locally administered address of its own for each robot's port or radio, so that guests can share a segment."""
+    return f"52:54:00:{'f2' if radio else 'f1'}:{number >> 8 & 0xFF:02x}:{number & 0xFF:02x}"
 
 
 def station_address(network: Network, *taken: IPv4Address) -> IPv4Address:

@@ -21,15 +21,17 @@ class RadioSegment(Segment):
 
     def __init__(
         self, fleet: Fleet, robots: Sequence[Robot], station: IPv4Address, directory: Path,
-        datagrams: Collection[tuple[IPv4Address, int]] = (), loss: float = 0.0, seed: int = 1,
+        datagrams: Collection[tuple[IPv4Address, int]] = (),
     ) -> None:  # fmt: skip
-        """As `Segment`; `loss`: of each attempt of a frame, 0 to 1."""
+        """As `Segment`. `air`: what may be disturbed."""
         ibss = fleet.network.ibss
         assert ibss, "the fleet has no cell"
         addresses = [robot.address for robot in robots]
         super().__init__(fleet.network, addresses, station, directory, datagrams, trunk=True)
-        self.air = Air(loss=loss, seed=seed)
-        self._adapters = {robot.name: self.air.adapter(robot.name, adapter_mac(robot.number), seed) for robot in robots}
+        self.air = Air()
+        self._adapters = {
+            robot.name: self.air.adapter(robot.name, qemu.robot_mac(robot.number, radio=True)) for robot in robots
+        }
         self.air.cable(STATION, self.link(addresses[0]), ibss)
 
     def __enter__(self) -> RadioSegment:
@@ -46,16 +48,10 @@ class RadioSegment(Segment):
 
 
 def segment_of(
-    fleet: Fleet, robots: Sequence[Robot], directory: Path, datagrams: Collection[tuple[IPv4Address, int]] = (),
-    loss: float = 0.0,
-) -> Segment:  # fmt: skip
-    """What the fleet's `network.link` connects its guests and the station with. `loss`: of frames on the air."""
+    fleet: Fleet, robots: Sequence[Robot], directory: Path, datagrams: Collection[tuple[IPv4Address, int]] = ()
+) -> Segment:
+    """What the fleet's `network.link` connects its guests and the station with."""
     station = station_address(fleet)
     if fleet.network.link == "ibss":
-        return RadioSegment(fleet, robots, station, directory, datagrams, loss)
+        return RadioSegment(fleet, robots, station, directory, datagrams)
     return Segment(fleet.network, [robot.address for robot in robots], station, directory, datagrams)
-
-
-def adapter_mac(number: int) -> str:
-    """A locally administered address of its own for each robot's adapter."""
-    return f"52:54:00:f2:{number >> 8 & 0xFF:02x}:{number & 0xFF:02x}"

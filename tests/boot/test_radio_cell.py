@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -28,7 +26,6 @@ from flotilla.robot import ssh
 from flotilla.station import services
 from images.builder import build
 from lab.containers import scale
-from lab.qemu import virtual_fleet
 from lab.qemu.guest import Guest
 from lab.qemu.radio_segment import RadioSegment, segment_of
 from lab.qemu.ssh import Ssh
@@ -38,6 +35,7 @@ from lab.scenarios.guests import GuestFleet
 from lab.scenarios.plans import TESTED_SIDE_M
 from lab.scenarios.virtual import Plan
 from tests.figures import PROPERTY
+from tests.provisioning.test_fleet import ANSIBLE, ENVIRONMENT, Guests
 
 SECONDS = 300
 """For what takes a few on an idle host."""
@@ -115,7 +113,7 @@ def is_well(lab: GuestFleet) -> None:
 
 
 def test_addresses_are_on_the_radio(lab: GuestFleet) -> None:
-    """SSH came by it already: nothing else is plugged in. Seen to fail with the card of `link: ethernet`."""
+    """SSH came by it already: nothing else is plugged in."""
     cell = lab.fleet.network.ibss
     assert cell
     for name, robot in robots(lab).items():
@@ -132,16 +130,10 @@ def test_addresses_are_on_the_radio(lab: GuestFleet) -> None:
 
 def test_provisioning_over_the_air_changes_nothing(lab: GuestFleet, described: Path, tmp_path: Path) -> None:
     ports = {name: lab.segment.ssh_port(robot.address) for name, robot in robots(lab).items()}
-    there = tmp_path / "guests.yml"
-    there.write_text(virtual_fleet.guests_inventory(ports))
-    program = Path(sys.executable).with_name("ansible-playbook")
-    argv = [str(program), "-i", str(described), "-i", str(there), "-l", "guests", "fleet.yml"]
-    environment = os.environ | {
-        "PATH": f"{program.parent}:{os.environ['PATH']}", "ANSIBLE_NOCOLOR": "1", "KEYS": str(paths.KEYS),
-        "BUILD": str(tmp_path / "build"),
-    }  # fmt: skip
+    there = Guests(robots(lab), dict(lab.machines), dict(lab.shells), ports, tmp_path)
     done = subprocess.run(
-        argv, cwd=paths.PROJECT / "ansible", env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        there.argv(inventory=described), cwd=ANSIBLE, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        env=ENVIRONMENT | {"KEYS": str(paths.KEYS), "BUILD": str(tmp_path / "build")},
         timeout=4 * SECONDS, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
@@ -170,7 +162,7 @@ def later(lab: GuestFleet, name: str, script: str) -> None:
     ids=["left", "another-cell", "another-channel"],
 )
 def test_what_drifts_is_named_and_mended(lab: GuestFleet, drift: str, because: str) -> None:
-    """By the robot itself, whom nobody reaches meanwhile. Seen to fail without `flotilla-cell@`: it never came back."""
+    """By the robot itself, whom nobody reaches meanwhile."""
     later(lab, ONE, f"iw dev wlan0 ibss leave; {drift}")
     until(lab, f"grep -q 'last because {because}$' /run/flotilla/cell")
     is_well(lab)

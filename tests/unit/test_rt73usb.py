@@ -110,7 +110,7 @@ def test_what_it_sends_has_rate_sequence_and_attempts() -> None:
 def test_beacons_are_of_the_cell_once_in_an_interval() -> None:
     bench = Bench()
     beacon = b"\x80\0\0\0" + ALL + MAC + BSSID + bytes(2) + bytes(8) + b"rest"
-    bench.write(0x2400, struct.pack("<6I", len(beacon) << 16 | 1 << 4 | 1 << 1, 0, 0, 0, 0, 0))
+    bench.write(0x2400, struct.pack("<6I", len(beacon) << 16 | 1 << 4 | 1 << 1, 0, 0, 0, 0, 1 << 24))
     bench.write(0x2418, beacon)
     bench.write(0x3064, struct.pack("<I", 1 << 20 | 1600))
     due = bench.adapter.next_tick_ns()
@@ -124,7 +124,9 @@ def test_beacons_are_of_the_cell_once_in_an_interval() -> None:
     (sent,) = bench.transmitted
     assert sent.is_beacon
     assert struct.unpack_from("<Q", sent.content, 24)[0] > 0, "it has no time stamp"
-    bench.write(0x2400, bytes(4))  # as the driver takes a beacon away; seen to end the cell's thread by an empty frame
+    bench.write(
+        0x2400, bytes(4)
+    )  # as the driver takes a beacon away; seen to send an empty frame then, which nobody can read
     again = bench.adapter.next_tick_ns()
     assert again
     bench.adapter.tick(again)

@@ -107,7 +107,7 @@ def test_what_tasks_say_of_themselves(robot: Path) -> None:
     [("in the cell", ""), (LOST := "in the cell; joined again 2 times, last because it had left it", LOST)],
 )
 def test_what_a_robot_says_of_the_cell(robot: Path, written: str, said: str) -> None:
-    """Seen to fail with the line taken for a task's."""
+    """Seen to fail with the line taken for a task's, too."""
     say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
     tell(robot, valves=7, sensors=0)
     program(robot, "cat", f'#!/bin/sh\n[ "$*" = /proc/uptime ] && echo 153.54 93.80 || echo "{written}"\n')
