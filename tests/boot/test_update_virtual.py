@@ -98,13 +98,13 @@ def test_control_would_end_under_an_updater_above_it(staged: Staged) -> None:
     assert "outputs are in their reset state" in said["task"]["log"]
 
 
-def test_each_step_of_a_bad_release_overruns(staged: Staged) -> None:
-    """By the library that tests/provisioning/test_update.py puts into a release: the runtime gives the task up."""
+def test_every_second_step_of_a_bad_release_overruns(staged: Staged) -> None:
+    """By the library that tests/provisioning/test_update.py puts into a release: the task lives, its health is bad."""
     said = staged.said[BAD]
     assert staged.said[ALONE]["statistics"]["overruns"] == 0
-    assert said["statistics"]["overruns"] == said["statistics"]["steps"] > 0
-    assert said["status"] == 1
-    assert "in a row; outputs are in their reset state" in said["log"]
+    assert said["statistics"]["steps"] > 0
+    assert said["statistics"]["overruns"] == pytest.approx(said["statistics"]["steps"] / 2, abs=1)
+    assert said["status"] == 0, said["log"]
 
 
 @pytest.mark.nightly
