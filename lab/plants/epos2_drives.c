@@ -14,7 +14,7 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
-enum { DRIVES = WHEELED_AXES, BURST = 64, HOMING_FAILS = 1 };
+enum { DRIVES = WHEELED_AXES, BURST = 64, HOMING_FAILS = 1, NO_POWER = 2 };
 
 struct drives {
     const char *interface;
@@ -40,7 +40,9 @@ static const struct fl_port inputs[] = {
      .type = FL_DOUBLE,
      .width = DRIVES,
      .flags = FL_OPTIONAL,
-     .summary = "code of a fault that the drive finds when this changes; 0: none; 1: no fault, but homing fails"},
+     .summary =
+         "code of a fault that the drive finds when this changes; 0: none; 1: no fault, but homing fails; 2: the "
+         "drive has no power"},
 };
 
 enum { TARGET, ENABLE, MODE, FRAMES, BITS, LOST };
@@ -116,7 +118,9 @@ static void measure(struct fl_block *block, struct state *state)
         drive->rpm = (int32_t)lround(speed[i] * set->gear * 60 / tau);
         drive->milliamperes = (int32_t)lround(1e3 * torque[i] / set->gear / set->torque_constant);
         drive->homing_fails = error[i] == HOMING_FAILS;
-        if (error[i] != state->error[i] && error[i] != 0 && !drive->homing_fails)
+        if (state->error[i] == NO_POWER && error[i] != NO_POWER)
+            drive_begin(drive, drive->node, block->release_ns, drive->counts);
+        if (error[i] != state->error[i] && error[i] > NO_POWER)
             drive_fail(drive, (uint16_t)error[i]);
         state->error[i] = error[i];
     }
@@ -130,7 +134,9 @@ static void demand(struct fl_block *block, const struct state *state)
         const struct drive *drive = &state->drive[i];
         double value = drive->demand;
         uint8_t mode = WHEELED_OFF;
-        if (drive->mode == -1) {
+        if (state->error[i] == NO_POWER) {
+            mode = WHEELED_OFF;
+        } else if (drive->mode == -1) {
             mode = WHEELED_POSITION;
             value *= tau / (set->counts * set->gear);
         } else if (drive->mode == -2) {
@@ -158,11 +164,15 @@ static int step(struct fl_block *block)
     for (int n = 0; n < BURST && recv(state->fd, &frame, sizeof frame, MSG_DONTWAIT) == (ssize_t)sizeof frame; n++) {
         count(block, &frame);
         for (int i = 0; i < DRIVES; i++) {
+            if (state->error[i] == NO_POWER)
+                continue;
             drive_take(&state->drive[i], &frame);
             send_all(block, state, &state->drive[i]);
         }
     }
     for (int i = 0; i < DRIVES; i++) {
+        if (state->error[i] == NO_POWER)
+            continue;
         drive_advance(&state->drive[i], block->release_ns);
         send_all(block, state, &state->drive[i]);
     }

@@ -35,6 +35,8 @@ RECORD_STEPS = 5
 BITRATE = 1_000_000
 NO_HOME = 1
 """In place of an error code: no fault, but a drive that is to search its home says that it cannot find it."""
+NO_POWER = 2
+"""In place of an error code: the drive is without power, and begins anew at the end."""
 _AT_ONCE_S = 1e-6
 
 
@@ -45,9 +47,9 @@ class Trouble:
     begin_s: float
     end_s: float
     what: str
-    """`scanner`: it is unplugged; `left`, `right` or `boom`: the drive finds a fault at the beginning, or no home."""
+    """`scanner`: it is unplugged; `left`, `right` or `boom`: its drive has this trouble."""
     code: int = 0x2310
-    """EMCY error code: overcurrent."""
+    """EMCY error code of the fault that it finds at the beginning, such as overcurrent; or NO_HOME or NO_POWER."""
 
 
 POSE_PORT = 5080

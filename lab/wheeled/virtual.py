@@ -26,7 +26,7 @@ from lab.scenarios.flight import Record, records
 from lab.scenarios.virtual import PLANT, far
 from lab.wheeled import plant
 from lab.wheeled.by_wires import fleet
-from lab.wheeled.plant import BITRATE, NO_HOME, Plant, Trouble
+from lab.wheeled.plant import BITRATE, NO_HOME, NO_POWER, Plant, Trouble
 
 HERE = Path(__file__).parent
 DIRECTORY = subject.DIRECTORY
@@ -89,12 +89,17 @@ SILENT_S = 23.0
 TOWARDS_S = (9.5, 18.5)
 _AROUND: Said = (0.3, 0.6, 0, True)
 TROUBLES = Course(
-    "troubles", 36,
+    "troubles", 43,
     [
         (0, _OFF), (3, _ON), (4, _AROUND), (16, _OFF), (16.5, _ON), (17.5, _AROUND), (24, _OFF), (24.5, _ON),
-        (25.5, _AROUND), (31.5, _OFF), (32, _ON), (33, _AROUND),
+        (25.5, _AROUND), (31.5, _OFF), (32, _ON), (33, _AROUND), (39.5, _OFF), (40, _ON), (41, _AROUND),
     ],
-    Plant(troubles=[Trouble(0.5, 15, "boom", NO_HOME), Trouble(7, 10, "scanner"), Trouble(13, 14, "left", 0x2310)]),
+    Plant(
+        troubles=[
+            Trouble(0.5, 15, "boom", NO_HOME), Trouble(7, 10, "scanner"), Trouble(13, 14, "left", 0x2310),
+            Trouble(36, 37, "right", NO_POWER),
+        ]
+    ),
     [
         (20, ("link", OWN, "down")), (22, ("link", OWN, "up")),
         (29, ("link", DRIVES, "down")), (29, ("report", OWN, BUS_OFF)),
@@ -102,7 +107,7 @@ TROUBLES = Course(
     ],
 )  # fmt: skip
 """Round and round; its boom finds no home, its scanner is unplugged for a while, a drive faults, its interface is set
-down, and its controller is bus-off.
+down, its controller is bus-off, and a drive loses its power.
 
 QEMU's controllers have no error counters, so the two reports of the last one are made by us, and the drives' interface
 is down meanwhile, as nothing passes. They reach the task by the socket of the real interface.

@@ -66,7 +66,7 @@ def card_with(fleet: Fleet, bad: Content, to: Path) -> Path:
 @pytest.mark.parametrize(
     ("fault", "sign", "bites"),
     [
-        pytest.param("panic", "Kernel panic", False, marks=pytest.mark.nightly),  # test_update.py has one
+        ("panic", "Kernel panic", False),
         ("hang before systemd", "", True),
         # systemd freezes: it lets go of the watchdog, which it has fed until then, and says so to nobody.
         ("service manager hangs", "WDT device closed unexpectedly", True),

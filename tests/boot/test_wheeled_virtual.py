@@ -26,6 +26,9 @@ DEAD_MAN_S = 1.0
 STOPS_S = 0.8
 """From a trouble to rest at 0.3 m/s: 0.25 s to 0.3 s until it is noticed."""
 
+ROLLS_S = 2.2
+"""The same where a wheel's motor is without power."""
+
 
 @pytest.fixture(scope="module")
 def driven(session_artefacts: Path) -> dict[str, Driven]:
@@ -200,6 +203,16 @@ def test_with_its_controller_bus_off_it_stops(troubles: Driven) -> None:
     assert said(troubles.logs["drive"], "can0", "bus-off")
     assert not any(report["left"] or report["right"] for report in troubles.told(29.5, 31))
     assert not at_rest(troubles.between(35, 36)[-1]), "it does not go on"
+
+
+def test_a_drive_that_loses_its_power_stops_both_wheels(troubles: Driven) -> None:
+    """The other one brakes; its own brakes nothing, and rolls out. It is configured again by itself; its motor is on
+    after the motors were switched off and on."""
+    rests(troubles, 36, ROLLS_S, 40.9)
+    assert said(troubles.logs["drive"], "drive 2", "no heartbeat")
+    assert not any(report["right"] for report in troubles.told(36.5, 39.5))
+    assert not at_rest(troubles.between(42, 43)[-1]), "it does not go on"
+    assert troubles.told(42, 42.2)[0]["right"]
 
 
 def test_it_stops_while_a_second_operator_commands(operators: Driven) -> None:

@@ -187,7 +187,7 @@ def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
     assert f"changed: [{OTHER}]" not in done.said.partition("Robots start it")[2]
 
 
-@pytest.mark.nightly
+@pytest.mark.nightly  # six minutes of a guest; tests/boot/test_update_virtual.py has the overruns
 def test_a_release_whose_control_overruns_goes_back(guests: Guests, make: Make) -> None:
     """Every second step of its tasks takes longer than a period, which no unit notices. The limit lets pass what a busy
     host does to guests."""
@@ -204,6 +204,7 @@ def test_a_release_whose_control_overruns_goes_back(guests: Guests, make: Make) 
     assert other["slots"]["B"]["release"] == "6", "it was not even brought there"
 
 
+@pytest.mark.nightly  # the play is that of an unwell robot; the panic is tried in tests/boot/test_bad_releases.py
 def test_a_release_that_does_not_start_goes_back(guests: Guests, make: Make) -> None:
     """Its first program is not there, so the kernel panics. What it changed below /etc is gone with it."""
     before = runs(guests)

@@ -15,7 +15,7 @@ import pytest
 from flotilla.common import paths
 from lab.emulators.can_bus import Frame, UdpHub
 from lab.emulators.epos2 import Axis, Epos2, Epos2Server
-from tests.running import PATIENCE, running
+from tests.running import PATIENCE, Task, running
 
 pytestmark = pytest.mark.clock
 
@@ -39,6 +39,7 @@ blocks:
   out: {type: can-send, in: {data: 7, age: 0}, parameters: {id: 0x123, length: 1}}
   back: {type: can-receive, parameters: {id: 0x123}}
 """
+FRAMES_WATCHED = "out.sent,out.flag,back.data,back.length,back.flag,back.sequence"
 
 WATCHED = "drive.position,drive.velocity,drive.current,drive.enabled,drive.flag,drive.error,drive.abort,drive.sequence"
 
@@ -463,10 +464,14 @@ def test_a_silent_drive_makes_the_flag_0(run: Any, hub: UdpHub) -> None:
 def test_frames_pass_between_two_blocks(run: Any, hub: UdpHub) -> None:
     with (
         Epos2Server(hub).running(),  # without a drive: the hub passes frames on while it is read
-        run(FRAMES, "out.sent,out.flag,back.data,back.length,back.flag,back.sequence") as task,
+        run(FRAMES, FRAMES_WATCHED) as task,
     ):
-        row = task.until(lambda row: row["back.sequence"] > 5)
-        assert row["back.data"] == [7, 0, 0, 0, 0, 0, 0, 0]
-        assert row["back.length"] == 1
-        assert row["back.flag"] == row["out.flag"] == 1
-        assert row["out.sent"] >= row["back.sequence"]
+        check_frames(task)
+
+
+def check_frames(task: Task) -> None:
+    row = task.until(lambda row: row["back.sequence"] > 5)
+    assert row["back.data"] == [7, 0, 0, 0, 0, 0, 0, 0]
+    assert row["back.length"] == 1
+    assert row["back.flag"] == row["out.flag"] == 1
+    assert row["out.sent"] >= row["back.sequence"]
