@@ -32,6 +32,49 @@ def run(*argv: str) -> None:
         raise RuntimeError(f"{' '.join(argv)}: status {done.returncode}: {done.stdout}{done.stderr}")
 
 
+class Air:
+    """The process that carries frames between the radios, each for its air time: air.c, loaded by a Python of its own.
+
+    Above all else: it is no computer's.
+    """
+
+    _PROGRAM = """
+import ctypes, sys
+air = ctypes.CDLL(sys.argv[1])
+air.carry.argtypes = [ctypes.c_int, ctypes.c_double, ctypes.c_int]
+status = air.carry(int(sys.argv[2]), float(sys.argv[3]), 1)
+told = ctypes.create_string_buffer(1000)
+air.tell(told, len(told))
+print(told.value.decode())
+sys.exit(status)
+"""
+
+    def __init__(self, settings: dict[str, Any], computers: list[dict[str, Any]]) -> None:
+        self._computers = computers
+        argv = ["chrt", "-f", "98", "python3", "-c", self._PROGRAM, settings["library"]]
+        argv += [str(len(computers)), str(settings["loss"])]
+        self._process = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout
+        if not self._process.stdout.readline():
+            raise RuntimeError(f"the air does not carry: status {self._process.wait()}")
+        self._set_rates("legacy-2.4", f"{settings['mbit_s']:g}")
+
+    def end(self) -> str:
+        """What it carried, as JSON. From then on frames arrive at once again."""
+        self._process.send_signal(signal.SIGTERM)
+        told, _ = self._process.communicate(timeout=_END_S)
+        if self._process.returncode:
+            raise RuntimeError(f"the air ended with status {self._process.returncode}")
+        self._set_rates()
+        return told
+
+    def _set_rates(self, *rates: str) -> None:
+        """Of frames to one computer; who adapts it would begin too low for the load, and never get out of that
+        queue. None: as it was."""
+        for computer in self._computers:
+            run("ip", "netns", "exec", computer["name"], "iw", "dev", "wlan0", "set", "bitrates", *rates)
+
+
 def join_cell(computers: list[dict[str, Any]]) -> None:
     """A namespace and a radio for each computer; all are in the cell of /etc/flotilla/ibss.conf when it returns."""
     run("modprobe", "mac80211_hwsim", f"radios={len(computers)}")
@@ -128,8 +171,10 @@ def wait_until(at_s: float, name: str, begin: float) -> None:
             tell(name, told_s)
 
 
-def fly(flight: dict[str, Any], out: Path) -> None:
+def fly(flight: dict[str, Any], computers: list[dict[str, Any]], out: Path) -> None:
     """Start the tasks, let things happen to them, end them; each has to end as asked."""
+    out.mkdir(parents=True)
+    air = Air(flight["air"], computers) if flight.get("air") else None
     begin = time.monotonic()
     happened: list[int] = []
     tasks = Flight(flight["tasks"], out)
@@ -144,6 +189,8 @@ def fly(flight: dict[str, Any], out: Path) -> None:
     statuses = tasks.end()
     if any(statuses.values()):
         raise RuntimeError(f"{flight['name']}: ended with {statuses}")
+    if air:
+        (out / "air.json").write_text(air.end())
 
 
 def join(computer: str) -> None:
@@ -164,7 +211,7 @@ def main(session: dict[str, Any], out: Path) -> dict[str, Any]:
         for task in session["safe"]:  # as a relay board is after power on
             run("flotilla-run", "--safe", task)
         for flight in session["flights"]:
-            fly(flight, out / flight["name"])
+            fly(flight, session["computers"], out / flight["name"])
             for computer in session["computers"]:
                 join(computer["name"])
     except Exception:

@@ -13,7 +13,7 @@ from lab.latency.results import Latency
 from lab.scenarios.flight import HOPS, Flight
 
 BASELINE = Path(__file__).with_name("baseline.json")
-GATED = ("udp", "dds")
+GATED = ("udp", "air", "dds")
 """Flights by their names: the square, undisturbed."""
 ACCEPT = "make scenarios-accept, commit it"
 _WHOLE = "four hops"

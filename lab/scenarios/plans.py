@@ -47,6 +47,7 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
     by_dds = square("dds", "the square, by DDS", side_m, transport="dds")
     return (
         square("udp", "the square, by UDP", side_m),
+        square("air", "the square, over the air of 802.11b", side_m, air_loss=0),
         replace(by_dds, seconds=max(by_dds.seconds, _ANNOUNCED_S)),
         square("loss", "the square, each radio losing a tenth", side_m, events=_LOSS),
         square("disorder", "the square, packets late, out of order and twice", side_m, events=_DISORDER),
@@ -80,6 +81,20 @@ def standby(side_m: float) -> tuple[Plan, ...]:
         ),
         square("no-standby", "the same without another", side_m, events=_CONTROL_LOST, seconds=12),
     )  # fmt: skip
+
+
+def over_the_air(side_m: float) -> tuple[Plan, ...]:
+    """The air of 802.11b that loses frames, that is cut, and that DDS uses; apart from the others for their time."""
+    by_dds = square("air-dds", "the square, by DDS, over the air of 802.11b", side_m, transport="dds", air_loss=0)
+    title = "the link cut, valves open, over the air of 802.11b that loses a tenth"
+    return (
+        *(
+            square(f"air-{percent}", f"the square, over the air that loses {percent} %", side_m, air_loss=percent / 100)
+            for percent in (1, 5, 10)
+        ),
+        replace(by_dds, seconds=max(by_dds.seconds, _ANNOUNCED_S)),
+        Plan("air-cut-open", title, 8, events=_CUT, plant=_SPIN, air_loss=0.1),
+    )
 
 
 def _strangers(side_m: float) -> Plan:

@@ -31,6 +31,9 @@ HERE = Path(__file__).parent
 INVENTORY = HERE / "inventory"
 PLANT = paths.PROJECT / "lab" / "plants"
 DIRECTORY = subject.DIRECTORY
+AIR = f"{DIRECTORY}/air.so"
+RATE_MBIT_S = 11
+"""Of frames to one computer on the air: the highest of 802.11b."""
 STATION = "station"
 SECOND = "second"
 """A further station, in the cell in each flight, and of the fleet in those whose plan says so."""
@@ -87,11 +90,14 @@ class Plan:
     """A computer that is not of the fleet sends to all ports of the control tasks, as often as they step."""
     changes: Mapping[str, object] = field(default_factory=dict)
     """Parameters of control tasks that are not those of their files, by `task.block.parameter`."""
+    air_loss: float | None = None
+    """Frames take their time on a channel of 802.11b that all share (air.c), and so many of the attempts get lost, 0
+    to 1; None: frames take no time on the air, and none gets lost."""
 
     @property
     def disturbed(self) -> bool:
         """Something happens that delays or loses messages on purpose."""
-        return bool(self.events or self.stranger)
+        return bool(self.events or self.stranger or self.air_loss is not None)
 
 
 def square(name: str, title: str, side_m: float, **more: Any) -> Plan:
@@ -233,7 +239,10 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
     if plan.stranger:
         shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]
         events.append(asdict(Event(0, "spawn", ["ip", "netns", "exec", STRANGER, *shout])))
-    return {"name": plan.name, "seconds": plan.seconds, "tasks": tasks, "events": events}, there
+    flight = {"name": plan.name, "seconds": plan.seconds, "tasks": tasks, "events": events}
+    if plan.air_loss is not None:
+        flight["air"] = {"library": AIR, "loss": plan.air_loss, "mbit_s": RATE_MBIT_S}
+    return flight, there
 
 
 def gyro_device(described: Fleet, board: Board) -> str:
@@ -247,6 +256,7 @@ def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
     there = {
         f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
         f"{DIRECTORY}/stranger.py": (HERE / "stranger.py").read_bytes(),
+        AIR: runtime.compile_plugin(HERE / "air.c", board.architecture),
     }
     flights = []
     for plan in plans:
