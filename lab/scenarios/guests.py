@@ -190,6 +190,12 @@ class GuestFleet:
         self.robot.release(velocity)
         self._igps.faults = Faults()
 
+    def hold(self) -> None:
+        """As before the first flight: no positions, and the path from its beginning, which the sensors' task knows."""
+        self._igps.faults = Faults(loss=1)
+        sensors = self.fleet.robot_with("sensors").name
+        self.shells[sensors].run(["sudo", "systemctl", "restart", "flotilla-task@sensors"], timeout=BOOT_SECONDS)
+
     @property
     def done(self) -> bool:
         """The path was commanded to its end."""

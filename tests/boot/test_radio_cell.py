@@ -229,6 +229,7 @@ def test_the_square_is_flown_with_loss(
 ) -> None:
     """Of each attempt of a frame; an adapter makes several. The bound is that of test_scenarios_guests.py."""
     lab.restart_with(virtual.square("udp", "the square", TESTED_SIDE_M))
+    lab.hold()
     segment.air.loss = loss
     try:
         lab.wait_connected()
