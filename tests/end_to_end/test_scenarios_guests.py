@@ -29,7 +29,12 @@ SPIN = (0.0, 0.0, 0.5)
 LIMIT_S = 300
 
 
-@pytest.fixture(scope="module", params=itertools.product(guests.HOW, guests.FLIGHTS), ids="-".join)
+# DDS over the emulated adapters of four guests is more than two processors can: half of the steps were lost, and four
+# hops took 130 ms. test_scenarios.py flies that in virtual time.
+FLOWN = [each for each in itertools.product(guests.HOW, guests.FLIGHTS) if each != ("ibss", "dds")]
+
+
+@pytest.fixture(scope="module", params=FLOWN, ids="-".join)
 def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuestFleet]:
     link, transport = request.param
     plan = virtual.square(transport, "the square", TESTED_SIDE_M, transport=transport)
