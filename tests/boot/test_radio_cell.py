@@ -62,9 +62,16 @@ def described(tmp_path_factory: pytest.TempPathFactory) -> Path:
     hosts = robots["robots"]["children"][f"board_{BOARD}"]["hosts"]
     hosts[ONE]["control_tasks"] += hosts.pop("robot3")["control_tasks"] + hosts.pop("robot4")["control_tasks"]
     (directory / "robots.yml").write_text(yaml.safe_dump(robots))
-    board = directory / f"group_vars/board_{BOARD}.yml"
-    board.write_text(board.read_text().replace("kernel: debian", "kernel: lean"))
+    our_kernel(directory)
     return directory
+
+
+def our_kernel(directory: Path) -> None:
+    """It boots in a third of the time."""
+    board = directory / f"group_vars/board_{BOARD}.yml"
+    said = board.read_text()
+    assert "kernel: debian" in said
+    board.write_text(said.replace("kernel: debian", "kernel: lean"))
 
 
 @pytest.fixture(scope="module")
@@ -259,6 +266,7 @@ def twelve(tmp_path: Path) -> Path:
     cell = {"ssid": "dozen", "frequency_mhz": 2462, "bssid": "02:00:00:00:00:12", "interface": "wlan0"}
     shared["network"] |= {"subnet": "172.20.7.0/24", "link": "ibss", "ibss": cell}
     file.write_text(yaml.safe_dump(shared))
+    our_kernel(directory)
     return directory
 
 
