@@ -13,11 +13,27 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+FOUND_S = 90
+"""For the two to find each other and send on a busy host."""
+
+
+def fragment_sizes(payload: bytes) -> set[int]:
+    """Of the RTPS submessages DATA_FRAG of a datagram."""
+    found = set()
+    position = 20  # behind the header of RTPS
+    while position + 4 <= len(payload):
+        kind, _, length = struct.unpack_from("<BBH", payload, position)
+        if kind == 0x16:
+            found.add(struct.unpack_from("<H", payload, position + 30)[0])
+        position += 4 + length if length else len(payload)
+    return found
+
 
 def main(configuration: str, domain: int, processes: int, seconds: float) -> dict[str, Any]:
     """What a subscriber, and a publisher of 8000 bytes, do with a configuration: on the wire and in the kernel.
 
-    Ports are counted from the domain's own. What goes to other computers is seen before it needs them to answer.
+    For so many seconds: of both from the first fragment of a sample on. Ports are counted from the domain's own. What
+    goes to other computers is seen before it needs them to answer.
     """
     first = 7400 + 250 * domain
     table = f"""table inet observed {{
@@ -29,6 +45,7 @@ def main(configuration: str, domain: int, processes: int, seconds: float) -> dic
     }}"""
     found: dict[str, Any] = {}
     payloads = []
+    fragments: set[int] = set()
 
     def shown(*argv: str) -> str:
         return subprocess.run(argv, capture_output=True, text=True, check=True).stdout
@@ -53,13 +70,16 @@ def main(configuration: str, domain: int, processes: int, seconds: float) -> dic
             cleanup.callback(process.wait)
             cleanup.callback(process.kill)
             running.append((process, log))
-        end = time.monotonic() + seconds
+        end = time.monotonic() + (FOUND_S if processes > 1 else seconds)
         while (left := end - time.monotonic()) > 0 and all(process.poll() is None for process, _ in running):
             if select.select([wire], [], [], min(left, 0.2))[0]:
                 packet = wire.recv(65536)
                 header = (packet[0] & 15) * 4
                 if packet[9] == 17 and first <= struct.unpack_from("!H", packet, header + 2)[0] < first + 250:
-                    payloads.append(packet[header + 8 :])
+                    payloads.append(payload := packet[header + 8 :])
+                    if (sizes := fragment_sizes(payload)) and not fragments:
+                        end = time.monotonic() + seconds
+                    fragments |= sizes
         found["ended"] = [process.poll() for process, _ in running]
         tasks = [path for process, _ in running for path in Path(f"/proc/{process.pid}/task").glob("*/comm")]
         found["threads"] = sorted({path.read_text().strip() for path in tasks})
@@ -78,17 +98,11 @@ def main(configuration: str, domain: int, processes: int, seconds: float) -> dic
         sent = re.findall(r"([\d.]+) \. (\d+)", shown("nft", "list set inet observed sent"))
         found["sent"] = sorted((peer, int(port) - first) for peer, port in sent)
         found["said"] = [log.read_text()[-1000:] for _, log in running]
-    advertised, fragments = set(), set()
+    advertised = set()
     for payload in payloads:
         # A locator: kind 1 (UDP over IPv4), port, sixteen bytes of address.
         for locator in re.finditer(rb"\x01\0\0\0..\0\0\0{12}(.{4})", payload, re.S):
             advertised.add(socket.inet_ntoa(locator[1]))
-        position = 20  # behind the header of RTPS
-        while position + 4 <= len(payload):
-            kind, _, length = struct.unpack_from("<BBH", payload, position)
-            if kind == 0x16:  # DATA_FRAG
-                fragments.add(struct.unpack_from("<H", payload, position + 30)[0])
-            position += 4 + length if length else len(payload)
     found["advertised"], found["fragments"] = sorted(advertised), sorted(fragments)
     found["largest"] = max(map(len, payloads), default=0)
     return found
