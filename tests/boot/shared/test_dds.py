@@ -48,7 +48,9 @@ def dds(pentium: RobotGuest, fleet: Fleet) -> dict[str, Any]:
     greedy = _edited(shipped, (r'<SocketReceiveBufferSize min=".*?"', '<SocketReceiveBufferSize min="8MB"'))
     runs = {"shipped": (shipped, 2), "changed": (changed, 2), "alone": (alone, 1), "greedy": (greedy, 1)}
     domain = fleet.network.dds_domain
-    return {name: call(pentium, observe_dds, text, domain, count, 3) for name, (text, count) in runs.items()}
+    return {
+        name: call(pentium, observe_dds, text, domain, count, 3, timeout=180) for name, (text, count) in runs.items()
+    }
 
 
 def _edited(text: str, *changes: tuple[str, str]) -> str:
