@@ -135,6 +135,7 @@ def test_addresses_are_on_the_radio(lab: GuestFleet) -> None:
         assert sh(lab, name, "cat /run/flotilla/cell") == "in the cell"
 
 
+@pytest.mark.nightly  # minutes of the guests' processors; test_fleet.py has the same play by wire
 def test_provisioning_over_the_air_changes_nothing(lab: GuestFleet, described: Path, tmp_path: Path) -> None:
     ports = {name: lab.segment.ssh_port(robot.address) for name, robot in robots(lab).items()}
     there = Guests(robots(lab), dict(lab.machines), dict(lab.shells), ports, tmp_path)
