@@ -386,7 +386,7 @@ def test_the_default_flight_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> No
     assert int(minutes[1]) <= 5
     everything = [there[name] for name in scenarios.chosen([scenarios.ALL], there)]
     said = scenarios.how_long(everything, ["smartcoret3"])
-    assert said.startswith("to fly: udp, dds, loss,")
+    assert said.startswith("to fly: udp, air, dds, loss,")
     assert "\nkernels to build first: smartcoret3, each about 7 minutes on two cores" in said
 
 
