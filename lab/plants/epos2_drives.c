@@ -120,6 +120,8 @@ static void measure(struct fl_block *block, struct state *state)
         drive->homing_fails = error[i] == HOMING_FAILS;
         if (state->error[i] == NO_POWER && error[i] != NO_POWER)
             drive_begin(drive, drive->node, block->release_ns, drive->counts);
+        if (error[i] == NO_POWER)
+            drive->mode = 0;
         if (error[i] != state->error[i] && error[i] > NO_POWER)
             drive_fail(drive, (uint16_t)error[i]);
         state->error[i] = error[i];
@@ -134,9 +136,7 @@ static void demand(struct fl_block *block, const struct state *state)
         const struct drive *drive = &state->drive[i];
         double value = drive->demand;
         uint8_t mode = WHEELED_OFF;
-        if (state->error[i] == NO_POWER) {
-            mode = WHEELED_OFF;
-        } else if (drive->mode == -1) {
+        if (drive->mode == -1) {
             mode = WHEELED_POSITION;
             value *= tau / (set->counts * set->gear);
         } else if (drive->mode == -2) {

@@ -70,7 +70,7 @@ sys.exit(status)
 
     def _set_rates(self, *rates: str) -> None:
         """Of frames to one computer; who adapts it would begin too low for the load, and never get out of that
-        queue. None: as it was."""
+        queue. Without rates: as it was."""
         for computer in self._computers:
             run("ip", "netns", "exec", computer["name"], "iw", "dev", "wlan0", "set", "bitrates", *rates)
 

@@ -14,7 +14,7 @@ from lab.scenarios.flight import HOPS, Flight
 
 BASELINE = Path(__file__).with_name("baseline.json")
 GATED = ("udp", "air", "dds")
-"""Flights by their names: the square, undisturbed."""
+"""Flights by their names: the square by each transport, and over the air that loses nothing."""
 ACCEPT = "make scenarios-accept, commit it"
 _WHOLE = "four hops"
 

@@ -461,7 +461,9 @@ def test_relays(lab: DeviceBench, start: Start) -> None:
 def test_frames_pass_between_two_boards(lab: DeviceBench, start: Start) -> None:
     """Seen to fail with the second one's link down."""
     lab.robot.shell.run(["sudo", "sh", "-ec", CAN_UP])
-    with start("can", can.FRAMES.replace("{id: 0x123}", "{id: 0x123, interface: can1}"), can.FRAMES_WATCHED) as task:
+    frames = yaml.safe_load(can.FRAMES)
+    frames["blocks"]["back"]["parameters"]["interface"] = "can1"
+    with start("can", yaml.safe_dump(frames), can.FRAMES_WATCHED) as task:
         can.check_frames(task)
 
 

@@ -37,14 +37,15 @@ DIVIDED = {"disorder": 2}
 
 TIMEOUT_S = 0.15
 """Until valves without good commands are closed: 0.05 s until a message is old, 0.1 s of the relay board's block."""
-CONTROL_TASKS = ("sensors", "navigation", "control", "thruster-mapping", "valves")
-LATE = 0.15
-"""Of steps over the air whose four hops may take longer than the limit."""
-HOP_US = 0.5e3
-"""At least, of a frame of 802.11b at 11 Mbit/s with its ACK: preambles of 192 µs, 10 µs between, 112 µs of ACK."""
 RECORD_S = 0.05
 """Between two records of the plant."""
 TIMEOUT_NS = round((TIMEOUT_S + RECORD_S) * 1e9)
+
+CONTROL_TASKS = ("sensors", "navigation", "control", "thruster-mapping", "valves")
+LATE = 0.15
+"""Of steps over the air whose four hops may take longer than the limit."""
+HOP_US = 500
+"""At least, of a frame of 802.11b at 11 Mbit/s with its ACK: preambles of 192 µs, 10 µs between, 112 µs of ACK."""
 
 HANDOVER_S = 0.0575
 """Between two commands at the valves when another computer takes over: 0.03 s until it is listened to, a period until
