@@ -38,7 +38,7 @@ from lab.qemu.ssh import Ssh
 
 pytest_plugins = ["tests.artefacts", "tests.figures", "tests.tiers", "tests.costs"]
 
-BOOT_SECONDS = 300
+BOOT_SECONDS = 1200
 """Until the login prompt. Some 30 s on an idle host; the limit only has to be finite, and generous to a busy one."""
 
 

@@ -22,6 +22,7 @@ LONGEST = (
     "test_power_cuts_guest.py",
     "test_power_cuts.py",
     "test_update.py",
+    "test_assigned_apps.py",
     "test_radio_cell.py",
     "test_bad_releases.py",
     "test_deploy.py",

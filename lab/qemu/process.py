@@ -21,7 +21,7 @@ from lab.qemu.timing import Deadline, Expired, LabError
 
 T = TypeVar("T")
 
-REPLY_SECONDS = 30
+REPLY_SECONDS = 120
 """QEMU answers at once; a busy host may take a while to let it."""
 
 

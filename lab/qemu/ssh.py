@@ -21,8 +21,10 @@ from flotilla.fleet.model import Robot
 from flotilla.robot.ssh import options as ssh_options
 from lab.qemu.timing import Deadline, Expired, LabError
 
-CONNECT_SECONDS = 120
+CONNECT_SECONDS = 600
 RETRY_SECONDS = 0.5
+COMMAND_SECONDS = 600
+"""Limit for what takes a few seconds on an idle host."""
 HOPELESS = ("Permission denied", "Host key verification failed", "REMOTE HOST IDENTIFICATION HAS CHANGED", "Bad owner")
 """What no waiting repairs."""
 
@@ -63,7 +65,7 @@ class Ssh:
         raise Expired(f"{self._robot.name}: no SSH within {timeout:g} s: {reason}")
 
     def run(
-        self, argv: Sequence[str], *, timeout: float = 60, check: bool = True, stdin: str = ""
+        self, argv: Sequence[str], *, timeout: float = COMMAND_SECONDS, check: bool = True, stdin: str = ""
     ) -> subprocess.CompletedProcess[str]:
         done = self._run(argv, timeout, stdin.encode())
         result = subprocess.CompletedProcess(list(argv), done.returncode, _text(done.stdout), _text(done.stderr))
@@ -73,7 +75,9 @@ class Ssh:
             )
         return result
 
-    def script(self, text: str, *, timeout: float = 60, check: bool = True) -> subprocess.CompletedProcess[str]:
+    def script(
+        self, text: str, *, timeout: float = COMMAND_SECONDS, check: bool = True
+    ) -> subprocess.CompletedProcess[str]:
         """Run a shell script as root, by a shell that waits for the next one. Its errors lack the last line's end.
 
         Where `run` is asked for `sudo sh -c`, an emulated Pentium III takes 0.3 s for the channel and sudo.

@@ -20,7 +20,7 @@ from lab.qemu import qemu
 from lab.qemu.console import SerialConsole
 from lab.qemu.process import Emulator
 
-START_SECONDS = 120
+START_SECONDS = 600
 """Limit for what takes one second on an idle host."""
 GAVE_UP = r"no slot can be loaded|slot .* does not boot|grub rescue>|grub>"
 """What the console shows when the boot loader starts nothing."""

@@ -44,9 +44,9 @@ INVENTORY = DIRECTORY / "inventory"
 _LOCK = DIRECTORY / "lock"
 """Locked by the process that holds the fleet, whose number stands in it: without the lock, all here is left behind."""
 _LOG = DIRECTORY / "log"
-BOOT_SECONDS = 300
+BOOT_SECONDS = 900
 DOWN_SECONDS = 30
-LET_IN_SECONDS = 300
+LET_IN_SECONDS = 900
 """What Ansible waits for a guest to let it in. Only finite: a host that is slow is no robot that is away, which ssh's
 own questions (`ServerAliveInterval`) tell from it."""
 STATUS = """

@@ -53,7 +53,7 @@ STARTS = ((0, 0, 0), (3.5, 0, math.pi), (3.5, -1.2, math.pi))
 """Where the robots begin: m, m, rad."""
 BOOT_SECONDS = 900
 """Until a guest lets us in. Only finite, and generous to a busy host."""
-BEGIN_SECONDS = 120
+BEGIN_SECONDS = 600
 _LOOPBACK = [IPv4Network(f"127.43.{number}.0/24") for number in range(1, 255)]
 """Where this computer may have robots: several labs at once take one each."""
 _LONGEST = 65536

@@ -81,10 +81,11 @@ def test_damaged_slot_falls_back_and_a_hang_ends(fresh_guest: GuestFactory, tmp_
     # The service manager alone stands still; the kernel, and all else, goes on.
     robot.machine.execute("watchdog-set-action", action="pause")
     sh(robot, "echo 1 >/sys/fs/cgroup/init.scope/cgroup.freeze")
-    while robot.machine.wait_event("WATCHDOG", 90)["data"]["action"] != "pause":
+    while robot.machine.wait_event("WATCHDOG", SECONDS)["data"]["action"] != "pause":
         pass  # of a boot that took the host longer than the watchdog waits
 
 
+@pytest.mark.nightly  # every state is tried with the boot loader and, in tests/runtime/test_slot.py, with the program
 def test_boot_state_is_repaired(fresh_guest: GuestFactory) -> None:
     """States that only the running system can repair, and a boot with all of them lost."""
     robot = fresh_guest(PENTIUM)

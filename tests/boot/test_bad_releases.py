@@ -67,10 +67,10 @@ def card_with(fleet: Fleet, bad: Content, to: Path) -> Path:
     ("fault", "sign", "bites"),
     [
         ("panic", "Kernel panic", False),
-        ("hang before systemd", "", True),
+        pytest.param("hang before systemd", "", True, marks=pytest.mark.nightly),
         # systemd freezes: it lets go of the watchdog, which it has fed until then, and says so to nobody.
         ("service manager hangs", "WDT device closed unexpectedly", True),
-        pytest.param("", "login: ", False, id="nobody-confirms"),
+        pytest.param("", "login: ", False, id="nobody-confirms", marks=pytest.mark.nightly),
     ],
 )
 def test_the_former_release_is_back_by_itself(

@@ -27,7 +27,7 @@ from lab.qemu.process import Exited
 from lab.qemu.segment import Segment
 from lab.qemu.timing import Expired, LabError
 
-SECONDS = 60
+SECONDS = 300
 """Limit for what takes one or two on an idle host."""
 NETWORK = Network(subnet=IPv4Network("10.42.0.0/24"), link="ethernet", dds_domain=0, udp_ports=[])
 ROBOT, OTHER, STATION = IPv4Address("10.42.0.3"), IPv4Address("10.42.0.4"), IPv4Address("10.42.0.250")

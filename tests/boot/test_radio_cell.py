@@ -37,7 +37,7 @@ from lab.scenarios.virtual import Plan
 from tests.figures import PROPERTY
 from tests.provisioning.test_fleet import ANSIBLE, ENVIRONMENT, Guests
 
-SECONDS = 300
+SECONDS = 900
 """For what takes a few on an idle host."""
 BOARD = "smartcoret3"
 ONE = "robot2"

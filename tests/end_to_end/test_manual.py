@@ -152,7 +152,7 @@ SHOWN = {
 """What some commands of the tutorial say, in part."""
 BOOT = "make boot ROBOT=3"
 """Takes a terminal, and stays."""
-BOOT_SECONDS = 300
+BOOT_SECONDS = 1200
 """Until the login prompt: finite, and generous to a busy host."""
 
 

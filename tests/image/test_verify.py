@@ -34,6 +34,7 @@ def test_second_build_elsewhere_is_identical() -> None:
     assert not KEPT.exists()
 
 
+@pytest.mark.nightly  # a whole build; unit/test_compare.py names differences
 def test_planted_difference_fails_and_is_named() -> None:
     done = verify("--plant")
     assert done.returncode == 1

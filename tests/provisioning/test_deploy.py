@@ -5,30 +5,23 @@ The guest does what robots do, and is reached by the same commands; only the way
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import yaml
 
-from flotilla.apps import app, assigned, deploy, remote, scaffold
+from flotilla.apps import app, deploy, remote, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
 from flotilla.robot import ssh
-from images.builder import build
 from lab.emulators.ir104 import Ir104
-from lab.qemu import virtual_fleet
 from lab.qemu.relay_ports import RelayPorts
 from tests.conftest import GuestFactory, RobotGuest
-from tests.provisioning.test_fleet import ANSIBLE, ENVIRONMENT, REPORTS, RUN_SECONDS, Playbook, altered
 from tests.running import judged_by_outcomes
 
 STUBBORN = r"""
@@ -59,17 +52,14 @@ RELAYS = next(
     if "relays:" in part.split("```")[0]
 )
 """The page's example of a safe.yml: two relays of the board at 0x300."""
-
-
-GIVEN = {"whole": "block", "changed": "make", "missing": "make", "stopped": "make"}
-"""Apps that the inventory gives to the robot, by name: their kinds."""
+NIGHTLY = [pytest.mark.nightly]
 
 
 class Bench:
     """The guest, its relays, and the directory of apps."""
 
-    def __init__(self, guest: RobotGuest, relays: Ir104, board: Board, apps: Path, given: Path) -> None:
-        self.guest, self.relays, self.board, self.apps, self.given = guest, relays, board, apps, given
+    def __init__(self, guest: RobotGuest, relays: Ir104, board: Board, apps: Path) -> None:
+        self.guest, self.relays, self.board, self.apps = guest, relays, board, apps
 
     @contextmanager
     def connection(self, number: int = 4, port: int | None = None) -> Iterator[remote.Connection]:
@@ -100,96 +90,19 @@ class Bench:
         return dict(line.split("=", 1) for line in self.do(name, "status").splitlines())
 
 
+@contextmanager
+def running(guest: GuestFactory, fleet: Fleet, apps: Path, image: Path | None = None) -> Iterator[Bench]:
+    """Robot 4, which has no task of its own, with a relay board. Its card is the usual one, or `image`."""
+    relays = Ir104()
+    with RelayPorts(relays) as ports:
+        robot = guest(4, image=image, qemu_options={"extra": ports.arguments})
+        yield Bench(robot, relays, fleet.boards[robot.robot.board], apps)
+
+
 @pytest.fixture(scope="module")
 def bench(module_guest: GuestFactory, fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Robot 4, which has no task of its own, with a relay board, and with the apps of `GIVEN` on its card."""
-    relays = Ir104()
-    given = tmp_path_factory.mktemp("given")
-    for name, kind in GIVEN.items():
-        scaffold.create(kind, name, given)
-        for task in (given / name).glob("task.yml"):
-            task.write_text(judged_by_outcomes(task.read_text()))
-    robot = fleet.robots[4].model_copy(update={"apps": list(GIVEN)})
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paths, "APPS", given)
-        other = fleet.model_copy(update={"robots": fleet.robots | {4: robot}})
-        (image,) = build.build(other, [robot], paths.IMAGES / "apps", assigned.built(other, [robot]))
-    with ExitStack() as stack:
-        ports = stack.enter_context(RelayPorts(relays))
-        guest = module_guest(4, image=image, qemu_options={"extra": ports.arguments})
-        yield Bench(guest, relays, fleet.boards[guest.robot.board], tmp_path_factory.mktemp("apps"), given)
-
-
-def play(bench: Bench, directory: Path, inventory: Path, *more: str) -> Playbook:
-    """`fleet.yml` for the guest, by another name: the report of a run has its playbook's, and others play it, too."""
-    playbook, guests = directory / "fleet-apps.yml", directory / "guests.yml"
-    playbook.write_text(yaml.safe_dump([{"import_playbook": str(ANSIBLE / "fleet.yml")}]))
-    guests.write_text(virtual_fleet.guests_inventory({bench.guest.robot.name: bench.guest.machine.ssh_port()}))
-    report = REPORTS / "fleet-apps.json"
-    report.unlink(missing_ok=True)
-    program = Path(sys.executable).with_name("ansible-playbook")
-    argv = [str(program), "-i", str(inventory), "-i", str(guests), "-l", "guests", str(playbook), *more]
-    done = subprocess.run(
-        argv, cwd=ANSIBLE, env=ENVIRONMENT | {"APPS": str(bench.given)}, stdin=subprocess.DEVNULL, capture_output=True,
-        text=True, timeout=RUN_SECONDS, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    print(f"fleet.yml took {json.loads(report.read_text())['duration_s']} s")
-    return Playbook(done.returncode, done.stdout + done.stderr, json.loads(report.read_text()))
-
-
-def test_apps_of_the_inventory_are_on_the_card_and_come_back(bench: Bench, tmp_path: Path) -> None:
-    """The first test, of a card as flashed. What comes after finds the guest without the inventory's apps.
-
-    Seen to fail where the files of an app are not looked at, and where the role brings an app without starting it.
-    """
-    robot = bench.guest.robot.name
-    inventory = altered(tmp_path, "robots.yml", "10.42.0.4\n", f"10.42.0.4\n          apps: [{', '.join(GIVEN)}]\n")
-    fresh = play(bench, tmp_path, inventory)
-    assert fresh.outcomes() == {robot: "up to date"}, fresh.repaired(robot)
-
-    by_hand = shutil.copytree(bench.given / "whole", bench.apps / "whole")
-    (by_hand / "task.yml").write_text((by_hand / "task.yml").read_text() + "# tried\n")
-    versions = there(bench)
-    with bench.connection() as to:
-        deploy.place(to, app.load(by_hand), bench.board)
-        deploy.place(to, app.load(bench.new("make", "tried")), bench.board)
-        deploy.command(to, "missing", "remove")
-    planted = "echo '# more' >>/data/apps/changed/unit.d/program.conf; systemctl stop flotilla-app@stopped"
-    bench.guest.shell.run(["sudo", "sh", "-c", planted])
-    tried = there(bench)
-    assert tried.keys() == {"whole", "changed", "stopped", "tried"}
-    expected = [
-        "app changed is not as built: unit.d/program.conf has another content",
-        "app missing is missing",
-        "app stopped does not run",
-        f"app whole is version {tried['whole']}, brought by hand, and the inventory's is {versions['whole']}",
-    ]
-    for more, outcome in ((("--check", "--diff"), "would change"), ((), "changed")):
-        done = play(bench, tmp_path, inventory, *more)
-        assert done.outcomes() == {robot: outcome}
-        found = sorted(line for line in done.repaired(robot) if line.startswith("app "))
-        assert [line.startswith(words) for line, words in zip(found, expected, strict=True)] == [True] * 4, found
-        (note,) = done.report["robots"][robot]["by_hand"]
-        assert note.startswith("app tried was brought by hand and stays; give it to the robot")
-        assert "RUN=remove" in done.said
-        assert there(bench) == (tried if more else versions | {"tried": tried["tried"]})
-    units = [f"flotilla-app@{name}.service" for name in GIVEN]
-    assert bench.guest.shell.run(["sudo", "systemctl", "is-active", *units]).stdout.split() == ["active"] * 4
-
-    without = play(bench, tmp_path, paths.INVENTORY)
-    gone = [f"app {name} is not the robot's any more" for name in sorted(GIVEN)]
-    assert [line for line in without.repaired(robot) if line.startswith("app ")] == gone
-    assert there(bench) == {"tried": tried["tried"]}
-    left = "find /etc/systemd/system /etc/flotilla /var/lib/flotilla-apps -name '*whole*'"
-    assert bench.guest.shell.run(["sudo", "sh", "-c", left]).stdout == ""
-    bench.do("tried", "remove")
-
-
-def there(bench: Bench) -> dict[str, str]:
-    """The robot's apps and their versions."""
-    links = bench.guest.shell.run(["find", "/data/apps", "-maxdepth", "1", "-type", "l", "-printf", r"%f %l\n"]).stdout
-    return {name: link.partition("@")[2] for name, link in map(str.split, links.splitlines())}
+    with running(module_guest, fleet, tmp_path_factory.mktemp("apps")) as bench:
+        yield bench
 
 
 def measured(said: str) -> tuple[float, int]:
@@ -219,7 +132,7 @@ def test_a_new_app_runs_until_it_is_interrupted_and_reports(bench: Bench, kind: 
     print(said)
 
 
-@pytest.mark.parametrize("kind", app.KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[] if kind == "block" else NIGHTLY) for kind in app.KINDS])
 def test_it_starts_and_stops_by_itself_again_and_again(bench: Bench, kind: str) -> None:
     name = f"again-{kind}"
     bench.place(bench.new(kind, name))

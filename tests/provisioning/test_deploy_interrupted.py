@@ -27,7 +27,7 @@ from flotilla.fleet.model import Board, Fleet
 from lab.containers import container, scale
 from lab.qemu.ssh import Ssh
 
-RUN_SECONDS = 600
+RUN_SECONDS = 1800
 RUNS = "trap 'exit 0' TERM; echo on >>$STATE_DIRECTORY/actuator; echo runs; while :; do sleep 0.05; done"
 FAILS = "echo on >>$STATE_DIRECTORY/actuator; exit 7"
 FAILS_WHEN_ASKED = "while ! [ -e $STATE_DIRECTORY/fail ]; do sleep 0.05; done; " + FAILS
@@ -119,7 +119,9 @@ class Station:
             moment,
         ]
         argv += ["1", str(self.app), *options]
-        done = subprocess.run(argv, capture_output=True, text=True, timeout=120, check=False, start_new_session=True)
+        done = subprocess.run(
+            argv, capture_output=True, text=True, timeout=RUN_SECONDS, check=False, start_new_session=True
+        )
         found = {"status": done.returncode, "err": done.stderr[-2000:], "out": done.stdout[-2000:]}
         found["state"] = self.root(f"systemctl show -P ActiveState {UNIT}")
         found["version"] = self.root("readlink /data/apps/hover || true").partition("@")[2]

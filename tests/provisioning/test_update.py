@@ -144,28 +144,30 @@ def test_the_updater_fits_into_its_memory(
 
 
 def test_a_release_is_brought_tried_and_kept(guests: Guests, make: Make) -> None:
-    """With the word of the station, and back again when told so."""
-    release = make(2)
-    staged = update(guests, release, "--tags", "stage", *ONE)
-    assert staged.status == 0, staged.said
-    assert runs(guests) == ("A", "1")
-
-    refused = update(guests, release, *ONE)
-    assert refused.status != 0
-    assert "runs flotilla-task@" in refused.said
-    assert (runs(guests), state(guests)["trial"]) == (("A", "1"), None)
-
-    guests.sudo(NAME, "echo kept >/etc/of-release-1")
-    done = update(guests, release, *STOP, *ONE)
+    """With the word of the station."""
+    done = update(guests, make(2), *STOP, *ONE)
     assert done.status == 0, done.said
     now = state(guests)
     assert (runs(guests), now["trial"], now["order"]) == (("B", "2"), None, ["B", "A"])
-    again = update(guests, release, *STOP, *ONE)
+
+
+@pytest.mark.nightly  # four plays more
+def test_a_release_goes_back_when_told_so(guests: Guests, make: Make) -> None:
+    """What runs already is not started once more, and nothing is started while a task runs."""
+    boot = boot_of(guests, NAME)
+    staged = update(guests, make(2), "--tags", "stage", *ONE)
+    assert (staged.status, boot_of(guests, NAME)) == (0, boot), staged.said
+    again = update(guests, make(2), *STOP, *ONE)
     assert (again.status, runs(guests)) == (0, ("B", "2")), again.said
+    refused = guests.play("-e", "go=back", *ONE, playbook="update")
+    assert refused.status != 0
+    assert "runs flotilla-task@" in refused.said
+    assert (runs(guests), state(guests)["trial"]) == (("B", "2"), None)
     back = guests.play("-e", "go=back", *STOP, *ONE, playbook="update")
     assert (back.status, runs(guests), state(guests)["order"]) == (0, ("A", "1"), ["A", "B"]), back.said
 
 
+@pytest.mark.nightly  # tests/boot/test_bad_releases.py tries the robot, unit/test_health.py the judgement
 def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
     """It lacks the driver of a required sensor's port, which is good before and after. Both robots have it on their
     cards then; the second one never starts it.

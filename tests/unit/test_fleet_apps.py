@@ -1,6 +1,6 @@
 """Apps of the inventory: what is on a card of them, what a robot says of its own, and what is made of that.
 
-That they are built, and repaired on a robot: tests/provisioning/test_deploy.py.
+That they are built, and repaired on a robot: tests/provisioning/test_assigned_apps.py.
 """
 
 from __future__ import annotations
