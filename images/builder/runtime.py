@@ -55,7 +55,9 @@ def command(work: Path, architecture: str, argv: Sequence[str], run: toolchain.R
     There, `work` is /out, and gets the public headers in /out/include. `run` says where that is; so does it below.
     """
     shutil.copytree(SOURCE / "include", work / "include")
-    run(f"runtime-{architecture}", work, argv, paths.BUILD / f"compile-{architecture}.log")
+    log = paths.BUILD / f"compile-{architecture}.log"
+    with cache.locked(log.with_name(f".{log.name}.lock")):  # an error shows what the log ends with
+        run(f"runtime-{architecture}", work, argv, log)
 
 
 def compile_plugin(

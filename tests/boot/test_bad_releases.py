@@ -69,7 +69,7 @@ def card_with(fleet: Fleet, bad: Content, to: Path) -> Path:
         ("panic", "Kernel panic", False),
         pytest.param("hang before systemd", "", True, marks=pytest.mark.nightly),
         # systemd freezes: it lets go of the watchdog, which it has fed until then, and says so to nobody.
-        ("service manager hangs", "WDT device closed unexpectedly", True),
+        pytest.param("service manager hangs", "WDT device closed unexpectedly", True, marks=pytest.mark.nightly),
         pytest.param("", "login: ", False, id="nobody-confirms", marks=pytest.mark.nightly),
     ],
 )

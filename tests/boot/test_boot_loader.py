@@ -161,7 +161,7 @@ def check(loader: BootLoader, name: str, state: State) -> Started:
 
 
 @pytest.mark.parametrize(
-    "every", [pytest.param(13, id="each-13th"), pytest.param(1, id="all", marks=pytest.mark.nightly)]
+    "every", [pytest.param(23, id="each-23rd"), pytest.param(1, id="all", marks=pytest.mark.nightly)]
 )
 def test_every_state_leads_to_its_slot(loader: BootLoader, every: int) -> None:
     """Of the states that can be written, with the tries that can be counted: by the rules who is

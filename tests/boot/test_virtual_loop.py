@@ -102,7 +102,7 @@ def test_a_drive_on_can_holds_its_velocity(said: dict[str, str]) -> None:
     assert left == "SWITCH_ON_DISABLED", "the drive keeps its power"
 
 
-@pytest.mark.nightly  # each time, flights and latencies repeat
+@pytest.mark.nightly  # each time, latencies repeat
 def test_loops_repeat_to_the_byte(said: dict[str, str], board: Board, artefacts: Path) -> None:
     """Seen to fail with a plug-in that writes its process number into a file that is shown."""
     assert run(board, artefacts) == said

@@ -244,7 +244,7 @@ def test_a_flood_of_commands_stops_it(operators: Driven) -> None:
     assert operators.plant[-1]["contacts"] == 0
 
 
-@pytest.mark.nightly  # each time, flights and latencies repeat
+@pytest.mark.nightly  # each time, latencies repeat
 def test_a_drive_repeats_to_the_byte(driven: dict[str, Driven], artefacts: Path) -> None:
     again = virtual.drive([COURSE, TROUBLES, OPERATORS], fleet().board(), artefacts / "wheeled")
     assert again == driven

@@ -367,6 +367,7 @@ def test_the_report_shows_every_flight(flown: dict[str, Flight], session_artefac
     assert figures[titles["udp"]]["rms_m"] == flown["udp"].error().rms_m
 
 
+@pytest.mark.nightly  # each time, latencies repeat
 def test_flights_repeat_to_the_byte(board: Board, artefacts: Path) -> None:
     """Once on a host that schedules at random. Seen to fail with another seed of the plant's noise."""
 

@@ -228,7 +228,8 @@ def test_an_app_that_leaks_is_killed_and_nothing_else(bench: Bench) -> None:
         pass  # asking takes a second
     assert status["ActiveState"] == "failed", status
     log = bench.guest.shell.run(["sudo", "journalctl", "-o", "cat", "-u", "flotilla-app@leaking"]).stdout
-    assert log.count("Main process exited, code=killed, status=9/KILL") == 5, log
+    # Not by the process's end, which a busy robot's service manager may not log.
+    assert log.count("Failed with result 'oom-kill'") == 5, log
     kernel = bench.guest.shell.run(["sudo", "journalctl", "-k", "-b", "-o", "cat"]).stdout
     killed = re.findall(r"out of memory: Killed process \d+ \((\w+)\)", kernel, re.IGNORECASE)
     assert (set(killed), len(killed)) == ({"leaking"}, 5), killed

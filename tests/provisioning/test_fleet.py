@@ -239,6 +239,7 @@ def test_a_robot_that_dies_stops_the_roll_out_and_nothing_is_half_done(guests: G
         assert guests.sudo(name, "cat /proc/sys/kernel/panic").strip() == "10"
 
 
+@pytest.mark.nightly
 def test_a_wrong_netmask_leaves_the_robot_at_its_old_address(guests: Guests, tmp_path: Path) -> None:
     """The network is too small for the station, which the robot can therefore no longer answer."""
     inventory = altered(tmp_path, "group_vars/all.yml", "10.42.0.0/24", "10.42.0.0/29")
