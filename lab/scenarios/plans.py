@@ -50,16 +50,22 @@ def plans(side_m: float = SIDE_M) -> tuple[Plan, ...]:
         square("air", "the square, over the air of 802.11b", side_m, air_loss=0),
         replace(by_dds, seconds=max(by_dds.seconds, _ANNOUNCED_S)),
         square("loss", "the square, each radio losing a tenth", side_m, events=_LOSS),
-        square("disorder", "the square, packets late, out of order and twice", side_m, events=_DISORDER),
-        square("gaps", "the square, one computer without power for a second, then one alone", side_m, events=_GAPS),
         _strangers(side_m),
-        Plan("cut-closed", "the link cut, valves closed", 8, events=_CUT, plant={"initial_velocity": [0.01, 0, 0]}),
         Plan("cut-open", "the link cut, valves open", 8, events=_CUT, plant=_SPIN),
         Plan(
             "cut-open-no-timeout", "the link cut, valves open, without a time-out", 8, events=_CUT, plant=_SPIN,
             changes={"valves.relays.timeout": 60},
         ),
     )  # fmt: skip
+
+
+def disturbed(side_m: float) -> tuple[Plan, ...]:
+    """Further disturbances of the network, by UDP; apart from the others for their time."""
+    return (
+        square("disorder", "the square, packets late, out of order and twice", side_m, events=_DISORDER),
+        square("gaps", "the square, one computer without power for a second, then one alone", side_m, events=_GAPS),
+        Plan("cut-closed", "the link cut, valves closed", 8, events=_CUT, plant={"initial_velocity": [0.01, 0, 0]}),
+    )
 
 
 def standby(side_m: float) -> tuple[Plan, ...]:

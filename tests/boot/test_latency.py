@@ -16,6 +16,8 @@ from lab.latency.results import Latency, Results
 from tests.perturb import perturbed_host
 
 KERNELS = ("lean", "debian")
+JUDGED = ["lean", pytest.param("debian", marks=pytest.mark.nightly)]
+"""Each time the one with which the tests below need its figures."""
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +37,7 @@ def measured(boards: dict[str, Board], session_artefacts: Path) -> Callable[[str
     return by_kernel
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("kernel", JUDGED)
 def test_latency_is_the_accepted_one(measured: Callable[[str], Results], boards: dict[str, Board], kernel: str) -> None:
     """Seen to fail by every negative control below, and whenever the root changes: then `make latency-accept`."""
     accepted = gate.check(measured(kernel), gate.baseline(boards[kernel], "quick"))
@@ -105,7 +107,7 @@ def test_the_loads_are_loads(measured: Callable[[str], Results]) -> None:
     assert busy["scheduler"] > 90
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("kernel", JUDGED)
 def test_the_system_is_up_as_shipped(measured: Callable[[str], Results], kernel: str) -> None:
     found = measured(kernel)
     assert found.boot.failed_units == []

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -45,6 +45,11 @@ def update(board: Board, toolset: Tools, flotilla_slot: Path, tmp_path_factory: 
     return scenario.update(board, toolset, directory, flotilla_slot, mib=MIB)
 
 
+def first_alone(mistakes: tuple[str, ...]) -> list[Any]:
+    """The first one each time, the others nightly."""
+    return [mistakes[0], *(pytest.param(mistake, marks=pytest.mark.nightly) for mistake in mistakes[1:])]
+
+
 def sound(verdict: Verdict) -> None:
     assert not verdict.bricks, command.describe("bricks", verdict)
     assert not verdict.wrong, command.describe("wrong releases", verdict)
@@ -62,7 +67,7 @@ def test_no_cut_of_an_update_bricks_or_starts_a_wrong_release(
     assert {"old in A", "new in B"} == set(verdict.started), "both releases are started, in some states each"
 
 
-@pytest.mark.parametrize("mistake", get_args(layout_1.Mistake))
+@pytest.mark.parametrize("mistake", first_alone(get_args(layout_1.Mistake)))
 def test_mistakes_of_the_first_layout_are_found(
     board: Board, toolset: Tools, tmp_path: Path, session_artefacts: Path, mistake: layout_1.Mistake
 ) -> None:
@@ -72,7 +77,7 @@ def test_mistakes_of_the_first_layout_are_found(
     assert not replay(board, recording, place, to_the_end=False).sound
 
 
-@pytest.mark.parametrize("mistake", scenario.MISTAKES)
+@pytest.mark.parametrize("mistake", first_alone(tuple(scenario.MISTAKES)))
 def test_mistakes_of_programs_are_found(board: Board, update: Recording, session_artefacts: Path, mistake: str) -> None:
     """The recording of an update that passes, but for one thing: the negative control of the test above."""
     recording = scenario.MISTAKES[mistake](update)

@@ -6,10 +6,10 @@ does, is in tests/boot/test_bad_releases.py, by the robot's own time.
 
 from __future__ import annotations
 
+import contextlib
 import json
-import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,9 @@ from tests.figures import PROPERTY
 from tests.provisioning.test_fleet import BOOT_SECONDS, Guests, Playbook, running
 from tests.releases import successor
 
-ROBOTS = 1, 4
-"""Of one board. The first has a control task and a gyro, the second has neither."""
-NAME, OTHER = (f"robot{number}" for number in ROBOTS)
+ROBOT = 1
+"""It has a control task and a gyro."""
+NAME = f"robot{ROBOT}"
 MEMORY_KIB = 16 << 10
 SECONDS = 600
 STOP = ("-e", "stop_tasks=true", "-e", "settle_s=2")
@@ -43,17 +43,21 @@ UPDATER = "/usr/lib/flotilla/update.py"
 Make = Callable[..., Path]
 
 
-@pytest.fixture(scope="module")
-def guests(fleet: Fleet, session_artefacts: Path) -> Iterator[Guests]:
-    robots = [inventory.robot(fleet, number) for number in ROBOTS]
+@contextlib.contextmanager
+def with_a_gyro(fleet: Fleet, numbers: Sequence[int], directory: Path) -> Iterator[Guests]:
+    """Guests of these robots; ROBOT's gyro is there."""
+    robots = [inventory.robot(fleet, number) for number in numbers]
     with tempfile.TemporaryDirectory(prefix="lab-") as scratch:  # sockets' paths must be short
         gyro = Path(scratch, "gyro")
-        plugged = {NAME: {robots[0].devices["gyro"].port: qemu.unix_socket(gyro)}}
-        with (
-            running(fleet, robots, session_artefacts / "update", **plugged) as guests,
-            SerialLine(Dsp3000(), UnixSocket(str(gyro))),
-        ):
+        plugged = {NAME: {inventory.robot(fleet, ROBOT).devices["gyro"].port: qemu.unix_socket(gyro)}}
+        with running(fleet, robots, directory, **plugged) as guests, SerialLine(Dsp3000(), UnixSocket(str(gyro))):
             yield guests
+
+
+@pytest.fixture(scope="module")
+def guests(fleet: Fleet, session_artefacts: Path) -> Iterator[Guests]:
+    with with_a_gyro(fleet, [ROBOT], session_artefacts / "update") as guests:
+        yield guests
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +66,7 @@ def make(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mak
 
     Their content is another than that of the robots' cards: the station has the delta.
     """
-    made = build.board_build(fleet.boards[inventory.robot(fleet, ROBOTS[0]).board], fleet.releases)
+    made = build.board_build(fleet.boards[inventory.robot(fleet, ROBOT).board], fleet.releases)
     content = successor(made, fleet.releases, tmp_path_factory.mktemp("content"))
     base = json.loads((made.slot / "header.json").read_text())["BLOB"]
     file = release.delta_of(base, content.header["BLOB"])
@@ -123,6 +127,7 @@ def within_limit(guests: Guests, command: str, content: bytes) -> tuple[dict[str
     return json.loads(told), int(peak) >> 10
 
 
+@pytest.mark.nightly  # with a delta that large; each time, tests/runtime/test_update.py takes deltas on this computer
 def test_the_updater_fits_into_its_memory(
     guests: Guests, make: Make, record_property: Callable[[str, object], None]
 ) -> None:
@@ -165,45 +170,6 @@ def test_a_release_goes_back_when_told_so(guests: Guests, make: Make) -> None:
     assert (runs(guests), state(guests)["trial"]) == (("B", "2"), None)
     back = guests.play("-e", "go=back", *STOP, *ONE, playbook="update")
     assert (back.status, runs(guests), state(guests)["order"]) == (0, ("A", "1"), ["A", "B"]), back.said
-
-
-@pytest.mark.nightly  # tests/boot/test_bad_releases.py tries the robot, unit/test_health.py the judgement
-def test_a_bad_release_touches_one_robot(guests: Guests, make: Make) -> None:
-    """It lacks the driver of a required sensor's port, which is good before and after. Both robots have it on their
-    cards then; the second one never starts it.
-
-    Seen to fail where the roll-out's last message does not name the sensor."""
-    guests.shells[NAME].script(GOOD, timeout=SECONDS)
-    before, boot = runs(guests), boot_of(guests, OTHER)
-    required = json.dumps({"health": {"overruns_percent": 100, "required_sensors": ["heading.gyro"]}})
-    done = update(guests, make(3, "dead sensor"), *STOP, "-e", required)
-    assert done.status != 0
-    assert f"{NAME} goes back to its release: {NAME} does not do well" in done.said, done.said
-    assert "heading.gyro: its flag is 0" in done.said, done.said
-    now = state(guests)
-    assert (runs(guests), now["trial"]) == (before, None)
-    guests.shells[NAME].script(GOOD, timeout=SECONDS)
-    other = state(guests, OTHER)
-    assert (boot_of(guests, OTHER), runs(guests, OTHER), other["trial"]) == (boot, ("A", "1"), None)
-    assert other["slots"]["B"]["release"] == "3", "it was not even brought there"
-    assert f"changed: [{OTHER}]" not in done.said.partition("Robots start it")[2]
-
-
-@pytest.mark.nightly  # six minutes of a guest; tests/boot/test_update_virtual.py has the overruns
-def test_a_release_whose_control_overruns_goes_back(guests: Guests, make: Make) -> None:
-    """Every second step of its tasks takes longer than a period, which no unit notices. The limit lets pass what a busy
-    host does to guests."""
-    before, boot = runs(guests), boot_of(guests, OTHER)
-    lenient = json.dumps({"health": {"overruns_percent": 25}})
-    done = update(guests, make(6, "overruns"), *STOP, "-e", lenient)
-    assert done.status != 0
-    assert f"{NAME} goes back to its release: {NAME} does not do well" in done.said, done.said
-    assert re.search(r"heading: \d+ of the last \d+ steps overran, more than 25 %", done.said), done.said
-    now = state(guests)
-    assert (runs(guests), now["trial"]) == (before, None)
-    other = state(guests, OTHER)
-    assert (boot_of(guests, OTHER), runs(guests, OTHER), other["trial"]) == (boot, ("A", "1"), None)
-    assert other["slots"]["B"]["release"] == "6", "it was not even brought there"
 
 
 @pytest.mark.nightly  # the play is that of an unwell robot; the panic is tried in tests/boot/test_bad_releases.py
