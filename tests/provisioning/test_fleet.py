@@ -249,11 +249,13 @@ def test_a_wrong_netmask_leaves_the_robot_at_its_old_address(guests: Guests, tmp
     assert guests.play("-l", "robot2").outcomes() == {"robot2": "up to date"}
 
 
-def test_the_wrong_robot_is_refused_with_the_reason(guests: Guests) -> None:
-    """Someone else answers where robot 2 should, and nobody where robot 1 should."""
+def test_the_wrong_robot_is_refused_with_the_reason(guests: Guests, tmp_path: Path) -> None:
+    """Someone else answers where robot 2 should, and nobody where robot 1 should. Connections of earlier runs are not
+    taken up: robot 1's is known by its port."""
     wrong = guests.ports | {"robot2": guests.ports["robot1"], "robot1": 1}
-    done = guests.play("-l", "robot1,robot2", *AT_ONCE, ports=wrong)
-    assert done.outcomes() == {"robot1": "unreachable", "robot2": "unreachable"}
+    anew = ENVIRONMENT | {"ANSIBLE_SSH_CONTROL_PATH_DIR": str(tmp_path)}
+    done = guests.play("-l", "robot1,robot2", *AT_ONCE, ports=wrong, environment=anew)
+    assert done.outcomes() == {"robot1": "unreachable", "robot2": "unreachable"}, done.report
     assert "Host key verification failed" in done.report["robots"]["robot2"]["messages"][0]
     assert "Connection refused" in done.report["robots"]["robot1"]["messages"][0]
 
