@@ -101,7 +101,7 @@ deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [ON_ROBOT=1] [KEE
 	    $(if $(filter-out 0,$(KEEP)),--keep) $(if $(filter-out 0,$(ON_ROBOT)),--on-robot)
 
 ##@ Inputs
-.PHONY: lock cve check-fleet requirements rotate-key
+.PHONY: lock cve check-fleet requirements
 lock: | setup ## resolve the package lists against the mirror: exact versions and hashes [ONLY=name of a lock]
 	$(Q)$(FLOTILLA) lock $(call option,--only,ONLY)
 
@@ -111,12 +111,24 @@ cve: | setup ## known vulnerabilities of what the locks hold, by Debian's tracke
 check-fleet: | setup ## validate the fleet's description
 	$(Q)$(FLOTILLA) check-fleet
 
-rotate-key: | setup ## a new host key for a robot: make rotate-key ROBOT=3, provision it, then RETIRE=1
-	$(Q)$(FLOTILLA) rotate-key $(call need,ROBOT) $(if $(filter-out 0,$(RETIRE)),--retire)
-
 requirements: | setup ## lock the Python environment anew from requirements.in
 	$(Q)$(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	    --no-header --no-annotate --quiet requirements.in -o requirements.lock
+
+##@ Keys
+.PHONY: rotate-key revoke-key backup-keys restore-keys
+rotate-key: | setup ## a new host key for a robot, or operator's key: make rotate-key ROBOT=3 or KEY=operator, provision, then RETIRE=1 [FORCE=1]
+	$(Q)$(FLOTILLA) rotate-key $(if $(value KEY),$(call given,KEY),$(call need,ROBOT)) $(if $(filter-out 0,$(RETIRE)),--retire) \
+	    $(if $(filter-out 0,$(FORCE)),--force)
+
+revoke-key: | setup ## refuse the host key of a robot that is in other hands: make revoke-key ROBOT=3, then provision the others
+	$(Q)$(FLOTILLA) revoke-key $(call need,ROBOT)
+
+backup-keys: | setup ## all keys in one encrypted file: make backup-keys OUT=FILE [PASSWORD_FILE=]
+	$(Q)$(FLOTILLA) backup-keys $(call need,OUT) $(call option,--password-file,PASSWORD_FILE)
+
+restore-keys: | setup ## put them back: make restore-keys FILE=FILE [PASSWORD_FILE=]
+	$(Q)$(FLOTILLA) restore-keys $(call need,FILE) $(call option,--password-file,PASSWORD_FILE)
 
 ##@ Quality
 .PHONY: check lint docs reference test test-all bench power-cuts

@@ -164,24 +164,80 @@ def _check_fleet(_: argparse.Namespace) -> None:
 
 
 def _rotate_key(arguments: argparse.Namespace) -> None:
-    from flotilla.fleet import identity, inventory
+    from flotilla.fleet import inventory, keys
+    from flotilla.robot import operator_key
 
     fleet = inventory.load_fleet()
-    robot = inventory.robot(fleet, arguments.robot)
+    if arguments.whose == _OPERATOR:
+        if arguments.retire:
+            operator_key.retire(fleet, force=arguments.force)
+            print("the former operator's key is gone; robots admit the new one alone")
+        else:
+            keys.rotate_operator_key()
+            print(
+                "there is a new operator's key; bring it to all robots with `make provision`, "
+                "then `make rotate-key KEY=operator RETIRE=1`"
+            )
+        return
+    robot = inventory.robot(fleet, arguments.whose)
     if arguments.retire:
-        identity.retire_host_key(fleet, robot)
+        keys.retire_host_key(fleet, robot)
         print(f"{robot.name}: this computer accepts its old host key no more")
     else:
-        identity.rotate_host_key(fleet, robot)
+        keys.rotate_host_key(fleet, robot)
         print(
             f"{robot.name}: has a new host key; bring it there with `make provision ROBOT={robot.number}`, "
             f"then `make rotate-key ROBOT={robot.number} RETIRE=1`"
         )
 
 
+_OPERATOR = "operator"
+
+
+def _whose(text: str) -> int | str:
+    return text if text == _OPERATOR else int(text)
+
+
+_whose.__name__ = f"robot's number or {_OPERATOR!r}"  # in argparse's errors
+
+
 def _rotate_key_arguments(parser: argparse.ArgumentParser) -> None:
-    robot_argument(parser)
+    parser.add_argument("whose", type=_whose, help=f"a robot's number in the inventory, or {_OPERATOR}")
     parser.add_argument("--retire", action="store_true", help="accept the old key no more")
+    parser.add_argument("--force", action="store_true", help="retire the operator's, whichever robots still want it")
+
+
+def _revoke_key(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory, keys
+
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    keys.revoke_host_key(fleet, robot)
+    print(
+        f"{robot.name}: its host key is refused here; `make provision` has the others refuse it. Its next card, by "
+        f"`make image ROBOT={robot.number}`, has a new one"
+    )
+
+
+def _backup_keys(arguments: argparse.Namespace) -> None:
+    from flotilla.common import paths
+    from flotilla.fleet import key_backup
+
+    files = key_backup.backup(arguments.file, arguments.password_file)
+    print(f"{paths.shown(arguments.file)}: {files} files of {paths.shown(paths.KEYS)}, encrypted")
+
+
+def _restore_keys(arguments: argparse.Namespace) -> None:
+    from flotilla.common import paths
+    from flotilla.fleet import key_backup
+
+    files = key_backup.restore(arguments.file, arguments.password_file)
+    print(f"{paths.shown(paths.KEYS)}: {files} files of {paths.shown(arguments.file)}")
+
+
+def _key_backup_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="the encrypted file")
+    parser.add_argument("--password-file", type=Path, metavar="FILE", help="has the passphrase; otherwise it is asked")
 
 
 def _ssh(arguments: argparse.Namespace) -> None:
@@ -478,7 +534,12 @@ COMMANDS = (
     Command("Inputs", "check-fleet", "check the fleet's description", _check_fleet),
     Command("Inputs", "lock", "resolve the package lists to exact versions", _lock, _lock_arguments),
     Command("Inputs", "cve", "name known vulnerabilities of what the locks hold", _cve, _cve_arguments),
-    Command("Inputs", "rotate-key", "give a robot a new host key", _rotate_key, _rotate_key_arguments),
+    Command("Keys", "rotate-key", "make a new host key of a robot, or a new operator's key", _rotate_key,
+            _rotate_key_arguments),
+    Command("Keys", "revoke-key", "refuse the host key of a robot that is in other hands", _revoke_key,
+            robot_argument),
+    Command("Keys", "backup-keys", "write all keys to one encrypted file", _backup_keys, _key_backup_arguments),
+    Command("Keys", "restore-keys", "put them back", _restore_keys, _key_backup_arguments),
     Command("Robots", "ssh", "open a shell on a robot, or on its guest when one runs", _ssh, robot_argument),
     Command("Robots", "param", "read or set parameters of a running task or app", _param, _param_arguments),
     Command("Robots", "scope", "print or record signals of a running task or app", _scope, _scope_arguments),

@@ -1,22 +1,16 @@
-"""What makes a card robot 3: the templates of rootfs_overlay/ rendered for it, and its keys.
-
-Keys are made once, when first needed, and kept in `paths.KEYS`: an SSH host key per robot, pinned everywhere, and the
-operator's key, which every robot admits.
-"""
+"""What makes a card robot 3: the templates of rootfs_overlay/ rendered for it."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import os
-import subprocess
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import apps, interfaces, transport
+from flotilla.fleet import apps, interfaces, keys, transport
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Fleet, Host, Robot
 
@@ -29,63 +23,6 @@ _CAN = PurePosixPath("etc/systemd/network/20-can.network.j2")
 """Rendered for each CAN interface of the robot, with its name in the file's."""
 _PRIVATE = {"ssh_host_ed25519_key.j2": 0o600}
 """Modes of templates whose result is not for everyone."""
-
-
-def key(name: str, comment: str) -> Path:
-    """The private key `name`, made if there is none."""
-    path = paths.KEYS / name
-    if not path.exists():
-        paths.KEYS.mkdir(parents=True, exist_ok=True, mode=0o700)
-        beside = path.with_name(f".{name}.new")
-        beside.unlink(missing_ok=True)
-        argv = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", comment, "-f", str(beside)]
-        try:
-            subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
-        except subprocess.CalledProcessError as error:
-            raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
-        beside.with_name(beside.name + ".pub").rename(path.with_name(name + ".pub"))
-        beside.rename(path)
-    return path
-
-
-def public_key(private: Path) -> str:
-    """The public half, without its comment."""
-    return " ".join(private.with_name(private.name + ".pub").read_text().split()[:2])
-
-
-def host_keys(fleet: Fleet) -> dict[str, str]:
-    """Public host key of every robot by name; makes what is missing, and the `known_hosts` that pins them."""
-    robots = sorted(fleet.robots.values(), key=lambda robot: robot.number)
-    keys = {robot.name: public_key(key(f"{robot.name}_ed25519", robot.name)) for robot in robots}
-    accepted = [(robot, keys[robot.name]) for robot in robots]
-    accepted += [(robot, _retired(robot).read_text().strip()) for robot in robots if _retired(robot).exists()]
-    pinned = "".join(f"{robot.name},{robot.address} {key}\n" for robot, key in accepted)
-    known = paths.KEYS / "known_hosts"
-    if not known.exists() or known.read_text() != pinned:
-        beside = known.with_name(f".known_hosts.{os.getpid()}")
-        beside.write_text(pinned)
-        beside.rename(known)
-    return keys
-
-
-def _retired(robot: Robot) -> Path:
-    """The public host key that a robot may still have, while its new one is on the way."""
-    return paths.KEYS / f"{robot.name}_ed25519.retired"
-
-
-def rotate_host_key(fleet: Fleet, robot: Robot) -> None:
-    """Give a robot a new host key. The old one is accepted on this computer until `retire_host_key`."""
-    private = paths.KEYS / f"{robot.name}_ed25519"
-    _retired(robot).write_text(host_keys(fleet)[robot.name] + "\n")
-    for file in (private, private.with_name(private.name + ".pub")):
-        file.unlink()
-    host_keys(fleet)
-
-
-def retire_host_key(fleet: Fleet, robot: Robot) -> None:
-    """Accept the old host key of a robot no more."""
-    _retired(robot).unlink(missing_ok=True)
-    host_keys(fleet)
 
 
 def hosts(fleet: Fleet) -> list[Host]:
@@ -118,19 +55,20 @@ def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
 
 def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
     """What the templates may use."""
-    keys = host_keys(fleet)
+    host_keys = keys.host_keys(fleet)
     first = _first_dds_port(fleet)
     return _description(fleet, robot) | {
         "hosts": hosts(fleet),
         "interface": fleet.interface(robot),
         "dds_ports": f"{first}-{first + 249}",
         "dds_peers": dds_peers(fleet, robot),
-        "host_keys": keys,
-        "host_public_key": keys[robot.name],
-        "host_private_key": (paths.KEYS / f"{robot.name}_ed25519").read_text(),
-        "operator_key": public_key(key("operator_ed25519", "operator")),
+        "host_keys": host_keys,
+        "revoked_keys": keys.revoked(),
+        "host_public_key": host_keys[robot.name],
+        "host_private_key": keys.of_robot(robot).read_text(),
+        "operator_key": keys.public(keys.operator()),
         # Stable, and not to be guessed back to anything (machine-id(5)).
-        "machine_id": hashlib.sha256(f"machine-id {keys[robot.name]}".encode()).hexdigest()[:32],
+        "machine_id": hashlib.sha256(f"machine-id {host_keys[robot.name]}".encode()).hexdigest()[:32],
     }
 
 

@@ -10,7 +10,7 @@ import json
 import re
 
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity
+from flotilla.fleet import keys as fleet_keys
 from flotilla.fleet.model import Releases
 
 NAMESPACE = "flotilla-release"
@@ -28,7 +28,7 @@ def document(releases: Releases) -> bytes:
         if given := _KEY.fullmatch(each):
             keys.append({"name": given[3], "key": f"{given[1]} {given[2]}"})
         elif re.fullmatch(r"[a-z0-9][a-z0-9-]*", each):
-            keys.append({"name": each, "key": identity.public_key(identity.key(f"{each}_ed25519", each))})
+            keys.append({"name": each, "key": fleet_keys.public(fleet_keys.make(f"{each}_ed25519", each))})
         else:
             raise UserError(
                 f"group_vars/all.yml: releases: keys: {each!r} is neither the name of a key, of small letters, digits "

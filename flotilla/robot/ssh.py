@@ -13,6 +13,7 @@ from pathlib import Path
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
+from flotilla.fleet import keys
 from flotilla.fleet.model import Robot
 
 FAILED = 255
@@ -36,16 +37,17 @@ def shell(robot: Robot, words: Sequence[str] = ()) -> None:
         raise UserError("ssh is missing on this computer; install it: sudo apt-get install openssh-client") from error
 
 
-def command(robot: Robot) -> list[str]:
-    """`ssh` to the robot's guest when one runs, else to the robot."""
+def command(robot: Robot, *, former: bool = True) -> list[str]:
+    """`ssh` to the robot's guest when one runs, else to the robot. `former`: as of `options`."""
     port = forwarded_port(robot)
-    return ["ssh", *options(robot), *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)])]
+    return ["ssh", *options(robot, former=former), *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)])]
 
 
-def output(robot: Robot, words: Sequence[str]) -> str:
+def output(robot: Robot, words: Sequence[str], *, former: bool = True) -> str:
     """What a command on the robot prints, without the last line's end; what it says on stderr, as UserError, when it
-    fails, or when it lasts longer than PATIENCE_S. A program's name before its message is left out."""
-    argv = [*command(robot), shlex.join(words)]
+    fails, or when it lasts longer than PATIENCE_S. A program's name before its message is left out. `former`: as of
+    `options`."""
+    argv = [*command(robot, former=former), shlex.join(words)]
     try:
         done = subprocess.run(
             argv, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False, timeout=PATIENCE_S
@@ -59,8 +61,9 @@ def output(robot: Robot, words: Sequence[str]) -> str:
     return done.stdout.rstrip("\n")
 
 
-def options(robot: Robot) -> list[str]:
-    """How every `ssh` to a robot proves who is who: the operator's key, the robot's pinned host key, nothing asked."""
+def options(robot: Robot, *, former: bool = True) -> list[str]:
+    """How every `ssh` to a robot proves who is who: the operator's key, the robot's pinned host key, nothing asked.
+    `former`: while the operator's key is rotated, the one before will do, too."""
     key, known_hosts = paths.KEYS / "operator_ed25519", paths.KEYS / "known_hosts"
     for file in (key, known_hosts):
         if not file.exists():
@@ -77,8 +80,11 @@ def options(robot: Robot) -> list[str]:
         # s: where nothing answers, not even a refusal, TCP alone would try for minutes.
         "ConnectTimeout": "20",
     }
+    pairs = list(settings.items())
+    if former and (before := keys.former_operator()):
+        pairs.append(("IdentityFile", str(before)))
     # Quoted, because ssh splits the values of file options at blanks.
-    return [word for name, value in settings.items() for word in ("-o", f'{name}="{value}"')]
+    return [word for name, value in pairs for word in ("-o", f'{name}="{value}"')]
 
 
 def no_answer(robot: Robot, reason: str) -> UserError:

@@ -33,8 +33,20 @@ COMMANDS = "sh"
 NEEDS_ROBOTS = "needs the robots; test_fleet.py plays the same on guests"
 ELSEWHERE = {
     "make test": "is what runs this",
-    "make rotate-key ROBOT=3": "changes the keys; test_fleet.py rotates one by the playbook",
-    "make rotate-key ROBOT=3 RETIRE=1": "likewise",
+    **dict.fromkeys(
+        (
+            "make rotate-key ROBOT=3",
+            "make rotate-key ROBOT=3 RETIRE=1",
+            "make rotate-key KEY=operator",
+            "make rotate-key KEY=operator RETIRE=1",
+            "make revoke-key ROBOT=3",
+        ),
+        "changes the keys; test_fleet.py does the same with a copy",
+    ),
+    **dict.fromkeys(
+        ("make backup-keys OUT=fleet-keys.vault", "make restore-keys FILE=fleet-keys.vault"),
+        "asks for a passphrase; unit/test_keys.py",
+    ),
     "make fleet N=2 LINK=ibss": "operations.md starts a fleet; test_radio_cell.py has guests in a cell",
     "lsblk": "shows this computer's disks, no program of ours",
     "make flash ROBOT=3 DEV=/dev/sdX": "needs a card; into a file below, on block devices in unit/test_flash.py",

@@ -323,23 +323,81 @@ def test_robots_restart_and_are_healthy(guests: Guests) -> None:
     assert guests.sudo("robot2", "cat /proc/sys/kernel/random/boot_id") != before
 
 
-@pytest.mark.nightly
-def test_a_new_card_can_get_a_new_host_key_everywhere(guests: Guests, tmp_path: Path) -> None:
-    """With keys of its own, so the last test of these guests."""
-    keys = tmp_path / "keys"
+@pytest.fixture(scope="module")
+def own_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy, for the last tests of these guests: what they make is in no other test's hands."""
+    keys = tmp_path_factory.mktemp("own") / "keys"
     shutil.copytree(paths.KEYS, keys)
-    old = (keys / "robot2_ed25519.pub").read_text().split()[1]
+    return keys
+
+
+def with_keys(keys: Path) -> dict[str, str]:
+    return ENVIRONMENT | {"KEYS": str(keys)}
+
+
+def flotilla(keys: Path, *words: str) -> str:
+    argv = [sys.executable, "-m", "flotilla", *words]
+    done = subprocess.run(argv, cwd=paths.PROJECT, env=with_keys(keys), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.nightly
+def test_a_new_card_can_get_a_new_host_key_everywhere(guests: Guests, own_keys: Path) -> None:
+    old = (own_keys / "robot2_ed25519.pub").read_text().split()[1]
     more = ("-l", "guests,localhost", "-e", json.dumps({"replaced": "robot2", "rotate": True}), *AT_ONCE)
-    done = guests.play(*more, playbook="replace", environment=ENVIRONMENT | {"KEYS": str(keys)})
+    done = guests.play(*more, playbook="replace", environment=with_keys(own_keys))
     assert done.status == 0, done.said
-    new = (keys / "robot2_ed25519.pub").read_text().split()[1]
+    new = (own_keys / "robot2_ed25519.pub").read_text().split()[1]
     assert new != old
-    assert old not in (keys / "known_hosts").read_text()
+    assert old not in (own_keys / "known_hosts").read_text()
     known = guests.sudo("robot1", "cat /etc/ssh/ssh_known_hosts")
     assert new in known
     assert old not in known
-    again = guests.play("-l", "robot2", environment=ENVIRONMENT | {"KEYS": str(keys)})
+    again = guests.play("-l", "robot2", environment=with_keys(own_keys))
     assert again.outcomes() == {"robot2": "up to date"}
+
+
+@pytest.mark.nightly
+def test_the_operators_key_is_rotated_and_no_robot_is_lost(guests: Guests, own_keys: Path) -> None:
+    def admitted(name: str, key: Path) -> bool:
+        settings = {
+            "IdentityFile": key, "IdentitiesOnly": "yes", "BatchMode": "yes", "HostKeyAlias": name,
+            "UserKnownHostsFile": own_keys / "known_hosts", "StrictHostKeyChecking": "yes",
+        }  # fmt: skip
+        words = [word for setting, value in settings.items() for word in ("-o", f"{setting}={value}")]
+        argv = ["ssh", "-F", "none", *words, "-p", str(guests.ports[name]), "robot@127.0.0.1", "true"]
+        done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=RUN_SECONDS)
+        assert done.returncode == 0 or "Permission denied" in done.stderr, done.stderr
+        return done.returncode == 0
+
+    flotilla(own_keys, "rotate-key", "operator")
+    new, former = own_keys / "operator_ed25519", own_keys / "operator_ed25519.retired"
+    assert (admitted("robot1", new), admitted("robot1", former)) == (False, True)
+    done = guests.play(*AT_ONCE, environment=with_keys(own_keys))
+    assert done.outcomes() == dict.fromkeys(guests.robots, "changed"), done.said
+    for name in guests.robots:
+        assert (admitted(name, new), admitted(name, former)) == (True, False)
+    flotilla(own_keys, "rotate-key", "operator", "--retire", "--force")
+    again = guests.play(*AT_ONCE, environment=with_keys(own_keys))
+    assert again.outcomes() == dict.fromkeys(guests.robots, "up to date"), again.said
+
+
+@pytest.mark.nightly
+def test_a_stolen_robot_that_comes_back_is_refused(guests: Guests, own_keys: Path, tmp_path: Path) -> None:
+    """By the station, and by the others once they are provisioned. It is the last test: the robot has lost its key."""
+    stolen = (own_keys / "robot2_ed25519.pub").read_text().split()[1]
+    flotilla(own_keys, "revoke-key", "2")
+    anew = with_keys(own_keys) | {"ANSIBLE_SSH_CONTROL_PATH_DIR": str(tmp_path)}
+    refused = guests.play("-l", "robot2", environment=anew)
+    assert refused.outcomes() == {"robot2": "unreachable"}
+    assert "REVOKED" in refused.report["robots"]["robot2"]["messages"][0], refused.report
+    done = guests.play("-l", "robot1", environment=anew)
+    assert done.outcomes() == {"robot1": "changed"}, done.said
+    assert f"@revoked * ssh-ed25519 {stolen}" in guests.sudo("robot1", "cat /etc/ssh/ssh_known_hosts").splitlines()
+    # From another robot, whatever name it goes by.
+    ask = "ssh -o BatchMode=yes -o StrictHostKeyChecking=yes -o HostKeyAlias=robot3 robot@10.42.0.2 true 2>&1 || true"
+    assert "REVOKED HOST KEY" in guests.sudo("robot1", ask)
 
 
 def altered(directory: Path, file: str, old: str, new: str) -> Path:

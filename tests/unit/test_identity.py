@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import stat
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -76,18 +75,6 @@ def test_a_task_talks_to_the_one_robot_that_has_the_other(fleet: Fleet) -> None:
 
 def test_rendering_repeats(fleet: Fleet) -> None:
     assert identity.render(fleet, fleet.robots[3]) == identity.render(fleet, fleet.robots[3])
-
-
-def test_keys_are_made_once_pinned_and_private(fleet: Fleet) -> None:
-    first = identity.host_keys(fleet)
-    assert identity.host_keys(fleet) == first
-    assert len(set(first.values())) == len(fleet.robots)
-    assert stat.S_IMODE((paths.KEYS / "robot3_ed25519").stat().st_mode) == 0o600
-    known = (paths.KEYS / "known_hosts").read_text()
-    assert f"robot3,{fleet.robots[3].address} {first['robot3']}\n" in known
-    content, mode = identity.render(fleet, fleet.robots[3])[PurePosixPath("/etc/ssh/ssh_host_ed25519_key")]
-    assert mode == 0o600
-    assert content == (paths.KEYS / "robot3_ed25519").read_bytes()
 
 
 def test_reading_a_description_pins_no_keys(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,16 +230,3 @@ def test_a_mistake_in_a_template_names_the_file(fleet: Fleet, tmp_path: Path, mo
 
 def test_the_fleet_model_survives_a_round_trip(fleet: Fleet) -> None:
     assert Fleet.model_validate(json.loads(fleet.model_dump_json())) == fleet
-
-
-def test_a_rotated_host_key_is_accepted_beside_the_old_one_until_that_is_retired(fleet: Fleet) -> None:
-    robot = fleet.robots[3]
-    old = identity.host_keys(fleet)["robot3"]
-    identity.rotate_host_key(fleet, robot)
-    new = identity.host_keys(fleet)["robot3"]
-    known = paths.KEYS / "known_hosts"
-    assert new != old
-    assert {f"robot3,10.42.0.3 {key}" for key in (old, new)} <= set(known.read_text().splitlines())
-    identity.retire_host_key(fleet, robot)
-    assert old not in known.read_text()
-    assert new in known.read_text()

@@ -1,0 +1,158 @@
+"""SSH keys of a fleet and their life: made once, when first needed, rotated, revoked. They lie in `paths.KEYS`.
+
+| file | what |
+|---|---|
+| `robotN_ed25519` | host key of a robot, pinned everywhere |
+| `operator_ed25519` | what every robot admits; it may have a passphrase, if an agent has it |
+| `NAME_ed25519.retired` | the former one, accepted until it is retired: public of a robot, private of the operator |
+| `revoked_keys` | public host keys that nobody accepts any more, a line each with the robot's name |
+| `known_hosts` | what of that `ssh` on this computer accepts; written anew when it differs |
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Fleet, Robot
+
+_OPERATOR = "operator_ed25519"
+
+
+def make(name: str, comment: str) -> Path:
+    """The private key `name`, made if there is none."""
+    path = paths.KEYS / name
+    if not path.exists():
+        paths.KEYS.mkdir(parents=True, exist_ok=True, mode=0o700)
+        beside = path.with_name(f".{name}.new")
+        beside.unlink(missing_ok=True)
+        argv = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", comment, "-f", str(beside)]
+        try:
+            subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+        except subprocess.CalledProcessError as error:
+            raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
+        _public_file(beside).rename(_public_file(path))
+        beside.rename(path)
+    return path
+
+
+def public(private: Path) -> str:
+    """The public half, without its comment."""
+    return " ".join(_public_file(private).read_text().split()[:2])
+
+
+def _public_file(private: Path) -> Path:
+    return private.with_name(private.name + ".pub")
+
+
+# --- robots' host keys ---
+
+
+def of_robot(robot: Robot) -> Path:
+    """The robot's private host key, made if there is none."""
+    return make(f"{robot.name}_ed25519", robot.name)
+
+
+def host_keys(fleet: Fleet) -> dict[str, str]:
+    """Public host key of every robot by name; makes what is missing, and the `known_hosts` that pins them."""
+    robots = sorted(fleet.robots.values(), key=lambda robot: robot.number)
+    keys = {robot.name: public(of_robot(robot)) for robot in robots}
+    accepted = [(robot, keys[robot.name]) for robot in robots]
+    accepted += [(robot, _retired(robot).read_text().strip()) for robot in robots if _retired(robot).exists()]
+    pinned = "".join(f"{robot.name},{robot.address} {key}\n" for robot, key in accepted)
+    pinned += "".join(f"@revoked * {key}\n" for key in revoked())
+    known = paths.KEYS / "known_hosts"
+    if not known.exists() or known.read_text() != pinned:
+        _write(known, pinned)
+    return keys
+
+
+def revoked() -> list[str]:
+    """Public host keys that nobody accepts, whoever has them."""
+    file = _revoked()
+    return [" ".join(line.split()[:2]) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def rotate_host_key(fleet: Fleet, robot: Robot) -> None:
+    """Give a robot a new host key. The old one is accepted on this computer until `retire_host_key`."""
+    _write(_retired(robot), host_keys(fleet)[robot.name] + "\n")
+    _remove(of_robot(robot))
+    host_keys(fleet)
+
+
+def retire_host_key(fleet: Fleet, robot: Robot) -> None:
+    """Accept the old host key of a robot no more."""
+    _retired(robot).unlink(missing_ok=True)
+    host_keys(fleet)
+
+
+def revoke_host_key(fleet: Fleet, robot: Robot) -> None:
+    """The robot or its card is in other hands: its keys are refused from now on, and its next card gets a new one."""
+    lost = [host_keys(fleet)[robot.name]]
+    if _retired(robot).exists():
+        lost.append(_retired(robot).read_text().strip())
+    before = _revoked().read_text() if _revoked().exists() else ""
+    _write(_revoked(), before + "".join(f"{key} {robot.name}\n" for key in lost))
+    _retired(robot).unlink(missing_ok=True)
+    _remove(of_robot(robot))
+    host_keys(fleet)
+
+
+def _retired(robot: Robot) -> Path:
+    """The public host key that a robot may still have, while its new one is on the way."""
+    return paths.KEYS / f"{robot.name}_ed25519.retired"
+
+
+def _revoked() -> Path:
+    return paths.KEYS / "revoked_keys"
+
+
+# --- the operator's key ---
+
+
+def operator() -> Path:
+    """The operator's private key, made if there is none."""
+    return make(_OPERATOR, "operator")
+
+
+def former_operator() -> Path | None:
+    """The private key that robots may still want, while the new one is on the way to them."""
+    path = paths.KEYS / f"{_OPERATOR}.retired"
+    return path if path.exists() else None
+
+
+def rotate_operator_key() -> None:
+    """A new operator's key. The former one is kept, because robots admit it until they are provisioned."""
+    if former := former_operator():
+        raise UserError(
+            f"{paths.shown(former)}: an earlier rotation has not ended; `make provision`, then "
+            "`make rotate-key KEY=operator RETIRE=1`"
+        )
+    now = operator()
+    former = paths.KEYS / f"{_OPERATOR}.retired"
+    now.rename(former)  # from here on whoever asks first makes a new one
+    _public_file(now).rename(_public_file(former))
+    operator()
+
+
+def retire_operator_key() -> None:
+    """Nothing on this computer uses the former key any more."""
+    if former := former_operator():
+        _remove(former)
+
+
+# ---
+
+
+def _remove(private: Path) -> None:
+    private.unlink()
+    _public_file(private).unlink(missing_ok=True)
+
+
+def _write(file: Path, text: str) -> None:
+    beside = file.with_name(f".{file.name}.{os.getpid()}")
+    beside.write_text(text)
+    beside.rename(file)

@@ -1,0 +1,261 @@
+"""Keys of a fleet: made once, rotated, revoked, backed up; the files that lie in its directory of keys."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import re
+import shutil
+import stat
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+from flotilla.cli import main as command_line
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import identity, key_backup, keys
+from flotilla.fleet.model import Fleet, Robot
+from flotilla.robot import operator_key, ssh
+
+
+@pytest.fixture(scope="module")
+def made(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys as they are made first."""
+    directory = tmp_path_factory.mktemp("made") / "keys"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paths, "KEYS", directory)
+        identity.render(fleet, fleet.robots[3])
+    return directory
+
+
+@pytest.fixture(autouse=True)
+def _keys(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(made, tmp_path / "keys")
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+
+
+def content() -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in paths.KEYS.iterdir()}
+
+
+def known_hosts() -> list[str]:
+    return (paths.KEYS / "known_hosts").read_text().splitlines()
+
+
+def test_keys_are_made_once_pinned_and_private(fleet: Fleet) -> None:
+    first = keys.host_keys(fleet)
+    assert keys.host_keys(fleet) == first
+    assert len(set(first.values())) == len(fleet.robots)
+    assert stat.S_IMODE((paths.KEYS / "robot3_ed25519").stat().st_mode) == 0o600
+    known = (paths.KEYS / "known_hosts").read_text()
+    assert f"robot3,{fleet.robots[3].address} {first['robot3']}\n" in known
+    content, mode = identity.render(fleet, fleet.robots[3])[PurePosixPath("/etc/ssh/ssh_host_ed25519_key")]
+    assert mode == 0o600
+    assert content == (paths.KEYS / "robot3_ed25519").read_bytes()
+
+
+def test_a_rotated_host_key_is_accepted_beside_the_old_one_until_that_is_retired(fleet: Fleet) -> None:
+    robot = fleet.robots[3]
+    old = keys.host_keys(fleet)["robot3"]
+    keys.rotate_host_key(fleet, robot)
+    new = keys.host_keys(fleet)["robot3"]
+    known = paths.KEYS / "known_hosts"
+    assert new != old
+    assert {f"robot3,10.42.0.3 {key}" for key in (old, new)} <= set(known.read_text().splitlines())
+    keys.retire_host_key(fleet, robot)
+    assert old not in known.read_text()
+    assert new in known.read_text()
+
+
+def test_a_revoked_host_key_is_refused_everywhere(fleet: Fleet) -> None:
+    """One that was being rotated, too, so both. Who has the robot meets `ssh`'s refusal, whatever address it takes."""
+    assert (
+        "@revoked" not in identity.render(fleet, fleet.robots[4])[PurePosixPath("/etc/ssh/ssh_known_hosts")][0].decode()
+    )
+    robot = fleet.robots[3]
+    old = keys.host_keys(fleet)["robot3"]
+    keys.rotate_host_key(fleet, robot)
+    newer = keys.host_keys(fleet)["robot3"]
+    keys.revoke_host_key(fleet, robot)
+    newest = keys.host_keys(fleet)["robot3"]
+    assert len({old, newer, newest}) == 3
+    assert keys.revoked() == [newer, old]
+    lines = [f"@revoked * {key}" for key in (newer, old)]
+    assert known_hosts()[-2:] == lines
+    assert [line for line in known_hosts()[:-2] if line.startswith("robot3,")] == [f"robot3,10.42.0.3 {newest}"]
+    on_robot, _ = identity.render(fleet, fleet.robots[4])[PurePosixPath("/etc/ssh/ssh_known_hosts")]
+    assert on_robot.decode().splitlines()[-2:] == lines
+    keys.revoke_host_key(fleet, robot)
+    assert keys.revoked() == [newer, old, newest]
+
+
+def test_an_operators_key_is_rotated_and_the_former_one_serves_until_it_is_retired(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = fleet.robots[3]
+    before = keys.operator().read_bytes()
+    assert identities(robot) == [str(paths.KEYS / "operator_ed25519")]
+    keys.rotate_operator_key()
+    former = keys.former_operator()
+    assert former
+    assert former.read_bytes() == before != keys.operator().read_bytes()
+    assert stat.S_IMODE(former.stat().st_mode) == 0o600
+    assert identities(robot) == [str(paths.KEYS / "operator_ed25519"), str(former)]
+    admitted, _ = identity.render(fleet, robot)[PurePosixPath("/etc/ssh/authorized_keys/robot")]
+    assert admitted.decode().split() == [*keys.public(keys.operator()).split()], "the new one alone"
+    with pytest.raises(UserError, match=r"operator_ed25519\.retired: an earlier rotation has not ended; .*RETIRE=1"):
+        keys.rotate_operator_key()
+
+    asked: list[str] = []
+
+    def output(robot: Robot, words: Sequence[str], *, former: bool) -> str:
+        assert not former, "the key that is to go would let itself in"
+        asked.append(robot.name)
+        if robot.name == "robot2":
+            raise UserError("robot2 did not answer: Permission denied")
+        return ""
+
+    monkeypatch.setattr(ssh, "output", output)
+    kept = content()
+    with pytest.raises(
+        UserError, match=r"^robot2 did not answer.*\nthe former operator's key is kept: .*make provision"
+    ):
+        operator_key.retire(fleet, force=False)
+    assert sorted(asked) == ["robot1", "robot2", "robot3", "robot4"]
+    assert content() == kept
+    operator_key.retire(fleet, force=True)
+    assert identities(robot) == [str(paths.KEYS / "operator_ed25519")]
+    assert not [name for name in content() if "retired" in name]
+    with pytest.raises(UserError, match="there is no former operator's key"):
+        operator_key.retire(fleet, force=False)
+
+
+def identities(robot: Robot) -> list[str]:
+    return re.findall(r'IdentityFile="(.*?)"', "\n".join(ssh.options(robot)))
+
+
+@pytest.mark.parametrize("interrupted_at", [1, 2])
+def test_an_interrupted_rotation_leaves_a_key_that_robots_admit(
+    interrupted_at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before either of the two renames."""
+    before = keys.operator().read_bytes()
+    rename, calls = Path.rename, []
+
+    def interrupted(file: Path, target: Path) -> Path:
+        calls.append(file)
+        if len(calls) == interrupted_at:
+            raise KeyboardInterrupt
+        return rename(file, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            keys.rotate_operator_key()
+    now = keys.operator()
+    assert keys.public(now) in subprocess.run(["ssh-keygen", "-y", "-f", now], capture_output=True, text=True).stdout
+    assert before in {now.read_bytes(), (former := keys.former_operator()) and former.read_bytes()}
+
+
+# --- backup ---
+
+
+@pytest.fixture
+def password(tmp_path: Path) -> Path:
+    file = tmp_path / "password"
+    file.write_text("correct horse\n")
+    return file
+
+
+def test_keys_come_back_from_a_backup(tmp_path: Path, password: Path) -> None:
+    """Encrypted: nothing of a key is in the file. What is there already is no obstacle, if it is the same."""
+    before, out = content(), tmp_path / "keys.backup"
+    assert key_backup.backup(out, password) == len(before)
+    assert stat.S_IMODE(out.stat().st_mode) == 0o600
+    assert out.read_bytes().startswith(b"$ANSIBLE_VAULT;1.1;AES256\n")
+    shutil.rmtree(paths.KEYS)
+    assert key_backup.restore(out, password) == len(before)
+    assert content() == before
+    assert {stat.S_IMODE(file.stat().st_mode) for file in paths.KEYS.iterdir()} == {0o600}
+    (paths.KEYS / "robot1_ed25519").unlink()
+    key_backup.restore(out, password)
+    assert content() == before
+
+
+def test_a_backup_replaces_no_other_keys(fleet: Fleet, tmp_path: Path, password: Path) -> None:
+    out = tmp_path / "keys.backup"
+    key_backup.backup(out, password)
+    keys.rotate_host_key(fleet, fleet.robots[3])
+    before = content()
+    with pytest.raises(
+        UserError, match=r"keys: known_hosts, robot3_ed25519, .*not those of the backup; move them away"
+    ):
+        key_backup.restore(out, password)
+    assert content() == before
+
+
+@pytest.mark.parametrize("damage", ["passphrase", "bytes", "no tar"])
+def test_a_backup_that_cannot_be_read_changes_nothing(tmp_path: Path, password: Path, damage: str) -> None:
+    before, out = content(), tmp_path / "keys.backup"
+    key_backup.backup(out, password)
+    if damage == "passphrase":
+        password.write_text("another\n")
+    elif damage == "bytes":
+        text = out.read_text()
+        out.write_text(text[:200] + ("0" if text[200] != "0" else "1") + text[201:])
+    else:
+        done = key_backup._vault("encrypt", password, b"no tar")
+        out.write_bytes(done)
+    with pytest.raises(UserError, match=r"no backup of keys" if damage == "no tar" else r"ansible-vault decrypt: .+"):
+        key_backup.restore(out, password)
+    assert content() == before
+
+
+def test_a_backup_that_fails_leaves_the_last_good_one(tmp_path: Path) -> None:
+    out = tmp_path / "keys.backup"
+    out.write_text("the last good one")
+    with pytest.raises(UserError, match=r"nowhere: no such file; it holds the passphrase"):
+        key_backup.backup(out, tmp_path / "nowhere")
+    assert out.read_text() == "the last good one"
+    with pytest.raises(UserError, match=r"no such file; `make backup-keys OUT=FILE` makes one"):
+        key_backup.restore(tmp_path / "none", tmp_path / "nowhere")
+
+
+def test_the_passphrase_is_asked_on_the_terminal(tmp_path: Path, password: Path) -> None:
+    """Twice, and not shown."""
+    out = tmp_path / "keys.backup"
+    environment = os.environ | {"KEYS": str(paths.KEYS)}
+    ours, theirs = pty.openpty()
+    asked = subprocess.Popen(
+        [sys.executable, "-m", "flotilla", "backup-keys", str(out)], cwd=paths.PROJECT, env=environment,
+        stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+        preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),  # which makes it the session's terminal
+    )  # fmt: skip
+    os.close(theirs)
+    said = ""
+    for question in ("New Vault password", "Confirm New Vault password"):
+        while not re.search(rf"\n?{question}[^\n]*: ", said):
+            said += os.read(ours, 4096).decode()
+        os.write(ours, b"correct horse\n")
+    with contextlib.suppress(OSError):  # nobody has the other end any more
+        while more := os.read(ours, 4096):
+            said += more.decode()
+    os.close(ours)
+    assert asked.wait() == 0, said
+    assert "encrypted" in said
+    assert "horse" not in said
+    shutil.rmtree(paths.KEYS)
+    assert key_backup.restore(out, password)
+
+
+@pytest.mark.parametrize("whose", ["operators", "0x3"])
+def test_whose_key_is_named(whose: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["flotilla", "rotate-key", whose])
+    with pytest.raises(SystemExit):
+        command_line.main()
+    assert f"invalid robot's number or 'operator' value: '{whose}'" in capsys.readouterr().err
