@@ -17,7 +17,7 @@ MAKEFLAGS += --no-print-directory
 .DEFAULT_GOAL := help
 
 ##@ Cards
-.PHONY: image images kernel flash boot ssh verify bundle size
+.PHONY: image images kernel flash boot ssh verify bundle verify-bundle size
 image: | setup ## card image of one robot: make image ROBOT=3
 	$(Q)$(FLOTILLA) image $(call need,ROBOT)
 
@@ -42,6 +42,9 @@ verify: | setup ## build a second time under other circumstances and compare to 
 
 bundle: | setup ## the release of a board for robots in service: make bundle [BOARD=] [SIGNATURES="FILE ..."]
 	$(Q)$(FLOTILLA) bundle $(if $(value BOARD),$(call given,BOARD)) $(addprefix --signature=,$(call each_given,SIGNATURES))
+
+verify-bundle: | setup ## build what a published bundle holds, and compare: make verify-bundle BUNDLE=file
+	$(Q)$(FLOTILLA) verify-bundle $(call need,BUNDLE)
 
 size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size $(call need,ROBOT)

@@ -74,6 +74,17 @@ def _verify_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", action="store_true", help="plant a difference, which must be found")
 
 
+def _verify_bundle(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import inventory
+    from images.builder import published
+
+    print(published.verify(inventory.load_fleet(), arguments.bundle))
+
+
+def _verify_bundle_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bundle", type=Path, help="what somebody published")
+
+
 def _size(arguments: argparse.Namespace) -> None:
     from flotilla.fleet import inventory
     from images.builder import build, size
@@ -528,6 +539,8 @@ COMMANDS = (
     Command("Cards", "kernel", "build a kernel of our own as a Debian package", _kernel, _kernel_arguments),
     Command("Cards", "verify", "build a second time in other circumstances and compare every byte", _verify,
             _verify_arguments),
+    Command("Cards", "verify-bundle", "build what a published bundle holds, and compare", _verify_bundle,
+            _verify_bundle_arguments),
     Command("Cards", "size", "show the largest packages and files of a robot's image", _size, robot_argument),
     Command("Cards", "bundle", "make the update bundle of a board", _bundle, _bundle_arguments),
     Command("Cards", "bench", "measure builds against other builders", _bench, _bench_arguments),

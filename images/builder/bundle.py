@@ -2,7 +2,7 @@
 
 | member | what |
 |---|---|
-| manifest.json | format, header of the slot, and the SHA-256 of each chunk of slot.img; robots judge a release by it |
+| manifest.json | format, header of the slot, SHA-256 of each chunk of slot.img and of the bills; robots judge by it |
 | manifest.json.NAME.sig | its signature by the key NAME (`ssh-keygen -Y sign`) |
 | sbom.spdx.json, sbom.cdx.json | bills of materials |
 | slot.img | root, kernel, initramfs and release keys: all that a slot holds but the header |
@@ -24,7 +24,7 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Board, Fleet, Releases
 from images.builder import manifest, slot
-from images.builder.build import board_build
+from images.builder.build import BoardBuild, board_build
 
 FORMAT = 1
 CHUNK_BYTES = 1 << 18
@@ -44,13 +44,18 @@ def make(fleet: Fleet, board: Board, signatures: Sequence[Path]) -> Path:
     final = file_of(board.name)
     with cache.exclusive():
         made = board_build(board, fleet.releases)
-        bills = {f"sbom.{end}": (made.manifest / f"sbom.{end}").read_bytes() for end in manifest.SBOMS}
+        bills = bills_of(made)
         signed = pack(final, made.slot, fleet.releases, bills, made.lock.epoch, signatures)
     print(
         f"{paths.shown(final)}: release {slot.release().release} of {board.name}, "
         f"{progress.size(final.stat().st_size)}, signed by {', '.join(signed)}, {time.monotonic() - started:.1f} s"
     )
     return final
+
+
+def bills_of(made: BoardBuild) -> dict[str, bytes]:
+    """A board's bills of materials as members of its bundle."""
+    return {f"sbom.{end}": (made.manifest / f"sbom.{end}").read_bytes() for end in manifest.SBOMS}
 
 
 def pack(
@@ -66,7 +71,7 @@ def pack(
     The manifest is left beside it, for those who sign elsewhere.
     """
     final.parent.mkdir(parents=True, exist_ok=True)
-    described = manifest_of(content)
+    described = manifest_of(content, bills)
     text = final.with_suffix(".manifest.json")
     text.write_bytes(described)
     signed = _signatures(text, releases, signatures)
@@ -82,14 +87,16 @@ def pack(
     return sorted(signed)
 
 
-def manifest_of(content: Path) -> bytes:
-    """The manifest of what `slot.build` made."""
+def manifest_of(content: Path, bills: Mapping[str, bytes]) -> bytes:
+    """The manifest of what `slot.build` made, and of its bills of materials."""
     chunks = []
     with (content / "slot.img").open("rb") as blob:
         while chunk := blob.read(CHUNK_BYTES):
             chunks.append(hashlib.sha256(chunk).hexdigest())
     header = json.loads((content / "header.json").read_text())
     described = {"format": FORMAT, "header": header, "chunk_bytes": CHUNK_BYTES, "chunks": chunks}
+    if bills:
+        described["bills"] = {name: hashlib.sha256(bill).hexdigest() for name, bill in sorted(bills.items())}
     return (json.dumps(described, indent=1) + "\n").encode()
 
 
@@ -103,7 +110,7 @@ def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> di
             argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", release_keys.NAMESPACE, "-f", str(private)]
             signed[key["name"]] = _ran(argv, text.read_bytes())
     for file in elsewhere:
-        name = next((key["name"] for key in trusted["keys"] if _signed_by(text, file, key)), None)
+        name = next((key["name"] for key in trusted["keys"] if signed_by(text, file, key)), None)
         if name is None:
             raise UserError(
                 f"{file}: is no signature of {paths.shown(text)} by a key of releases in group_vars/all.yml; make it "
@@ -120,7 +127,8 @@ def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> di
     return signed
 
 
-def _signed_by(text: Path, signature: Path, key: dict[str, str]) -> bool:
+def signed_by(text: Path, signature: Path, key: Mapping[str, str]) -> bool:
+    """Whether a key of `release_keys.document` has made this signature of a file. Writes beside it."""
     allowed = text.with_suffix(".allowed")
     allowed.write_text(f'{key["name"]} namespaces="{release_keys.NAMESPACE}" {key["key"]}\n')
     argv = ["ssh-keygen", "-Y", "verify", "-f", str(allowed), "-I", key["name"], "-n", release_keys.NAMESPACE]

@@ -225,7 +225,7 @@ def _manifest(release: Held, directory: Path) -> bytes:
     """What `update.py begin` reads, signed by the key that is here."""
     (directory / "slot.img").write_bytes(release.content)
     (directory / "header.json").write_text(json.dumps(dict(release.header)))
-    text = bundle.manifest_of(directory)
+    text = bundle.manifest_of(directory, {})
     key = paths.KEYS / "release_ed25519"
     argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", release_keys.NAMESPACE, "-f", str(key)]
     signature = subprocess.run(argv, input=text, capture_output=True, check=True).stdout

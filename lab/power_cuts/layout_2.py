@@ -178,7 +178,7 @@ class Robot:
         (self._directory / brought.name).mkdir(exist_ok=True)
         (self._directory / brought.name / "slot.img").write_bytes(brought.content)
         (self._directory / brought.name / "header.json").write_text(json.dumps(brought.header))
-        manifest = bundle.manifest_of(self._directory / brought.name).decode()
+        manifest = bundle.manifest_of(self._directory / brought.name, {}).decode()
         with self._mounted() as file:
             answer = self._update(file, "begin", json.dumps({"manifest": manifest, "signatures": []}).encode())
             size = int(answer["chunk_bytes"])

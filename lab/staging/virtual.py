@@ -94,7 +94,7 @@ def update(board: Board, directory: Path) -> Update:
         (place / "header.json").write_text(json.dumps(headers[number]))
     made = directory / "delta"
     delta.make(directory / "1/slot.img", directory / "2/slot.img", made)
-    manifest = bundle.manifest_of(directory / "2").decode()
+    manifest = bundle.manifest_of(directory / "2", {}).decode()
     sent = made.read_bytes()
     symbols, lost = tape(sent)
     a = card.SLOTS[0]

@@ -26,6 +26,7 @@ GIVEN = {
     "ssh": ["ROBOT"],
     "verify": ["ROBOT"],
     "size": ["ROBOT"],
+    "verify-bundle": ["BUNDLE"],
     "fleet": ["N"],
     "fleet-scale": ["N", "BOARD"],
     "provision": ["PLAYBOOK", "ROBOT"],
