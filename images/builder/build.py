@@ -42,7 +42,7 @@ def board_build(board: Board, releases: Releases | None = None) -> BoardBuild:
     root = rootfs.build(board, lock, tools_lock)
     content = slot.build(board, root, release_keys.document(releases or Releases()), slot.release())
     base = card.base(board, content, toolset, lock.epoch)
-    described = manifest.shared(board, lock, root, content, base, toolset)
+    described = manifest.shared(board, (lock, tools_lock), root, content, base, toolset)
     return BoardBuild(board, lock, tools_lock, toolset, root, content, base, described)
 
 

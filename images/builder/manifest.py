@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 from pydantic import BaseModel, ConfigDict, JsonValue
 
@@ -34,6 +35,8 @@ FORMAT: Literal[1] = 1
 """Rises when a reader of older manifests would misread a new one."""
 SBOMS = ("spdx.json", "cdx.json")
 """Endings of the bills of materials: SPDX 2.3 and CycloneDX."""
+_BOOT_LOADER = "grub-pc-bin"
+"""Of the build tools: its code is on the card, before the first partition."""
 _DPKG_STATUS = "var/lib/dpkg/status"
 _CHUNK = 1 << 20
 """Bytes hashed at a time."""
@@ -167,14 +170,16 @@ def read(image: Path, remedy: str) -> Manifest:
 # --- once per board ---
 
 
-def shared(board: Board, lock: Lock, root: Path, content: Path, base: Path, tools: Tools) -> Path:
+def shared(board: Board, locks: tuple[Lock, Lock], root: Path, content: Path, base: Path, tools: Tools) -> Path:
     """Directory with `shared.json` and the bills of materials of a board's robots.
 
-    `root`, `content`, `base`: what `rootfs.build`, `slot.build` and `card.base` made.
+    `locks`: the board's and the build tools'. `root`, `content`, `base`: what `rootfs.build`, `slot.build` and
+    `card.base` made.
     """
+    lock, tools_lock = locks
     key = cache.digest(
-        board.name, lock.digest, root.name, base.name, tools.directory.name, paths.PROJECT / "requirements.lock",
-        Path(__file__),
+        board.name, lock.digest, tools_lock.digest, root.name, base.name, tools.directory.name,
+        paths.PROJECT / "requirements.lock", Path(__file__),
     )  # fmt: skip
 
     def make(out: Path) -> None:
@@ -191,7 +196,7 @@ def shared(board: Board, lock: Lock, root: Path, content: Path, base: Path, tool
         if installed != locked:  # a defect of the builder, not the user's
             raise RuntimeError(f"installed and locked packages differ: {sorted(installed ^ locked)}")
         (out / "shared.json").write_text(made.model_dump_json())
-        sboms(board.name, lock, status, out)
+        sboms(board.name, locks, status, out)
 
     return cache.result("manifest", key, make)
 
@@ -226,11 +231,13 @@ def packages(status: str) -> list[Package]:
     return sorted(found, key=lambda package: package.name)
 
 
-def sboms(board: str, lock: Lock, status: str, out: Path) -> None:
-    """Write `sbom.spdx.json` and `sbom.cdx.json` about the packages of a dpkg status file.
+def sboms(board: str, locks: tuple[Lock, Lock], status: str, out: Path) -> None:
+    """Write `sbom.spdx.json` and `sbom.cdx.json` about the packages of a dpkg status file, the boot loader, and the
+    tools that made the card. `locks`: the board's and the build tools'.
 
     debsbom reads a root directory: the status, and for the packages' hashes an index as apt keeps it.
     """
+    lock, tools_lock = locks
     hashes = {package.name: package.sha256 for package in lock.packages}
     root = out / "root"
     apt = root / "var/lib/apt/lists"
@@ -248,7 +255,7 @@ def sboms(board: str, lock: Lock, status: str, out: Path) -> None:
         f"Origin: Debian\nCodename: {suite.name}\nArchitectures: {lock.architecture}\nComponents: main\n"
     )
     (apt / f"flotilla_main_binary-{lock.architecture}_Packages").write_text("".join(index), encoding="utf-8")
-    content = hashlib.sha256(status.encode()).hexdigest()
+    content = hashlib.sha256(f"{tools_lock.digest} {status}".encode()).hexdigest()
     identity = uuid.uuid5(uuid.NAMESPACE_OID, f"flotilla {board} {lock.digest} {content}")
     program = Path(sys.executable).with_name("debsbom")
     argv = [
@@ -266,7 +273,8 @@ def sboms(board: str, lock: Lock, status: str, out: Path) -> None:
         raise UserError(f"debsbom failed (status {done.returncode}): {done.stderr.strip()}")
     for ending in SBOMS:
         made = out / f"made.{ending}"
-        document = _with_missing_suites(_sorted(json.loads(made.read_text(encoding="utf-8"))), lock)
+        document = _with_missing_suites(json.loads(made.read_text(encoding="utf-8")), lock)
+        document = _sorted(_with_tools(document, tools_lock))
         text = json.dumps(document, indent=1, ensure_ascii=False, sort_keys=True)
         (out / f"sbom.{ending}").write_text(text + "\n", encoding="utf-8")
         made.unlink()
@@ -281,6 +289,56 @@ def _with_missing_suites(document: dict[str, Any], lock: Lock) -> dict[str, Any]
     elif missing:
         properties = document["metadata"].setdefault("properties", [])
         properties += [{"name": "flotilla:missing-suite", "value": name} for name in missing]
+    return document
+
+
+def _with_tools(document: dict[str, Any], lock: Lock) -> dict[str, Any]:
+    """The bill with the packages that made the card. What is of the boot loader is a part of the system, too."""
+    suite = lock.suites[0].name
+    purls = {
+        package.name: f"pkg:deb/debian/{package.name}@{quote(package.version, safe=':~')}?arch={package.architecture}"
+        f"&distro={suite}"
+        for package in lock.packages
+    }
+    if "spdxVersion" in document:
+        relationships = document["relationships"]
+        (system,) = (it["relatedSpdxElement"] for it in relationships if it["relationshipType"] == "DESCRIBES")
+        for package in lock.packages:
+            reference = f"SPDXRef-tool-{package.name.replace('+', '.plus')}"
+            document["packages"].append(
+                {
+                    "SPDXID": reference, "name": package.name, "versionInfo": package.version,
+                    "checksums": [{"algorithm": "SHA256", "checksumValue": package.sha256}],
+                    "externalRefs": [
+                        {
+                            "referenceCategory": "PACKAGE_MANAGER", "referenceType": "purl",
+                            "referenceLocator": purls[package.name],
+                        }
+                    ],
+                    "downloadLocation": "NOASSERTION", "filesAnalyzed": False, "primaryPackagePurpose": "APPLICATION",
+                    "licenseConcluded": "NOASSERTION", "licenseDeclared": "NOASSERTION", "copyrightText": "NOASSERTION",
+                }
+            )  # fmt: skip
+            kinds = ["BUILD_TOOL_OF", *(["PACKAGE_OF"] if package.name == _BOOT_LOADER else [])]
+            relationships += [
+                {"spdxElementId": reference, "relatedSpdxElement": system, "relationshipType": kind} for kind in kinds
+            ]
+        return document
+    components = [
+        {
+            "type": "application", "bom-ref": f"tool/{package.name}", "name": package.name, "version": package.version,
+            "purl": purls[package.name], "hashes": [{"alg": "SHA-256", "content": package.sha256}],
+        }
+        for package in lock.packages
+    ]  # fmt: skip
+    # CycloneDX, "formulation": what was used to make it, apart from what it consists of.
+    document["formulation"] = [{"bom-ref": "tools", "components": components}]
+    loader = next((dict(each) for each in components if each["name"] == _BOOT_LOADER), None)
+    if loader:
+        loader["bom-ref"] = f"boot-loader/{_BOOT_LOADER}"
+        document["components"].append(loader)
+        system = document["metadata"]["component"]["bom-ref"]
+        next(it for it in document["dependencies"] if it["ref"] == system)["dependsOn"].append(loader["bom-ref"])
     return document
 
 

@@ -12,6 +12,10 @@ from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
 
 import pytest
+from cyclonedx.schema import SchemaVersion
+from cyclonedx.validation.json import JsonStrictValidator
+from spdx_tools.spdx.parser.parse_anything import parse_file
+from spdx_tools.spdx.validation.document_validator import validate_full_spdx_document
 
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
@@ -81,7 +85,7 @@ def test_packages_have_their_sources() -> None:
 
 def sboms(status: str, out: Path) -> dict[str, bytes]:
     out.mkdir()
-    manifest.sboms("board", LOCK, status, out)
+    manifest.sboms("board", (LOCK, read_lock("tools")), status, out)
     return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
@@ -102,6 +106,36 @@ def test_bills_of_materials(tmp_path: Path) -> None:
     assert other["serialNumber"] != cdx["serialNumber"]
 
 
+def test_bills_name_the_boot_loader_and_the_tools_that_made_the_card(tmp_path: Path) -> None:
+    """By the readers of those who made the formats."""
+    made = sboms(STATUS, tmp_path / "one")
+    tools = {package.name: package for package in read_lock("tools").packages}
+    spdx, cdx = json.loads(made["sbom.spdx.json"]), json.loads(made["sbom.cdx.json"])
+    names = {package["SPDXID"]: package["name"] for package in spdx["packages"]}
+    related = {(names.get(it["spdxElementId"]), it["relationshipType"]) for it in spdx["relationships"]}
+    assert {(name, "BUILD_TOOL_OF") for name in tools} <= related
+    assert ("grub-pc-bin", "PACKAGE_OF") in related
+    assert ("mksquashfs", "PACKAGE_OF") not in related
+    document = parse_file(str(tmp_path / "one/sbom.spdx.json"))
+    assert validate_full_spdx_document(document) == []
+    used = {each["name"]: each for each in cdx["formulation"][0]["components"]}
+    assert used.keys() == tools.keys()
+    assert used["grub-pc-bin"]["hashes"][0]["content"] == tools["grub-pc-bin"].sha256
+    assert "grub-pc-bin" in {each["name"] for each in cdx["components"]}
+    judge = JsonStrictValidator(SchemaVersion.from_version(cdx["specVersion"]))
+    wrong = judge.validate_str(made["sbom.cdx.json"].decode())
+    assert wrong is None, wrong
+    other = json.loads(bills_with_other_tools(tmp_path / "other")["sbom.cdx.json"])
+    assert other["serialNumber"] != cdx["serialNumber"]
+
+
+def bills_with_other_tools(out: Path) -> dict[str, bytes]:
+    tools = read_lock("tools")
+    out.mkdir()
+    manifest.sboms("board", (LOCK, replace(tools, packages=tools.packages[1:])), STATUS, out)
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
 def test_a_lock_without_a_suite_is_told_everywhere(fleet: Fleet, tmp_path: Path) -> None:
     """A planted lock: i386's, with and without the suite of security updates."""
     names = ("bookworm", "bookworm-updates", "bookworm-security")
@@ -111,7 +145,7 @@ def test_a_lock_without_a_suite_is_told_everywhere(fleet: Fleet, tmp_path: Path)
         assert list(parse_lock(format_lock(lock), "board", "board.lock").missing_suites) == missing
         out = tmp_path / str(len(missing))
         out.mkdir()
-        manifest.sboms("board", lock, STATUS, out)
+        manifest.sboms("board", (lock, read_lock("tools")), STATUS, out)
         spdx, cdx = (json.loads((out / f"sbom.{ending}").read_text()) for ending in manifest.SBOMS)
         assert ("bookworm-security" in spdx.get("comment", "")) == bool(missing)
         told = [each["value"] for each in cdx["metadata"].get("properties", []) if each["name"].startswith("flotilla")]
