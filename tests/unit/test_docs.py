@@ -6,11 +6,13 @@ import fnmatch
 import functools
 import re
 import subprocess
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pytest
 
 from flotilla.common import paths
+from flotilla.fleet import identity
+from flotilla.fleet.model import Fleet
 
 TROUBLESHOOTING = paths.PROJECT / "docs" / "troubleshooting.md"
 OUTPUTS = ("build/", "apps/", "ansible/keys/")
@@ -105,3 +107,39 @@ def test_each_check_sees_what_is_wrong() -> None:
     assert dead_links(wrong, Path()) == ["docs/stile.md"]
     assert unknown_targets(wrong) == {"imgae"}
     assert unsaid("| `no slot left, … all again` | |\n| `no slot right` | |\n") == ["no slot right"]
+
+
+# --- ports and threats ---
+
+THREATS = paths.PROJECT / "docs" / "explanation" / "threats.md"
+PORT = re.compile(r"^\| (ICMP echo|(?:TCP|UDP) [\d-]+) \|", re.MULTILINE)
+
+
+def admitted(rules: str) -> set[str]:
+    """What a robot's firewall lets in, in the words of the page."""
+    ports = re.search(r"udp dport \{ (.*) \} accept", rules)
+    assert ports
+    found = {f"UDP {port}" for port in ports[1].split(", ")} | set(
+        re.findall(r"daddr \S+ (udp) dport (\d+) accept", rules)
+    )
+    named = {each if isinstance(each, str) else f"UDP {each[1]}" for each in found}
+    named |= {f"TCP {port}" for port in re.findall(r"tcp dport (\d+) accept", rules)}
+    return named | ({"ICMP echo"} if "icmp type echo-request accept" in rules else set())
+
+
+def test_the_page_of_ports_is_the_firewall(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+    rules, _ = identity.render(fleet, fleet.robots[1])[PurePosixPath("/etc/nftables.conf")]
+    assert set(PORT.findall(THREATS.read_text())) == admitted(rules.decode())
+    assert "TCP 2323" in admitted(rules.decode().replace("tcp dport 22 accept", "tcp dport 2323 accept"))
+
+
+def test_each_threat_has_a_test_or_is_not_defended() -> None:
+    """Seen to fail with tests of other names."""
+    rows = [line.split(" | ") for line in THREATS.read_text().partition("## Threats")[2].splitlines()[4:]]
+    assert len(rows) > 10
+    for who, attempt, result, test in rows:
+        named = re.findall(r"`(tests/\S+)::(\w+)`", test)
+        assert named or "**not defended**" in result, f"{who} | {attempt}"
+        for file, name in named:
+            assert f"\ndef {name}(" in (paths.PROJECT / file).read_text(), f"{file}::{name}"
