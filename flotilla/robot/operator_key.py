@@ -28,7 +28,7 @@ def retire(fleet: Fleet, *, force: bool) -> None:
 def _refusals(robots: Iterable[Robot]) -> Iterable[str]:
     def refusal(robot: Robot) -> str | None:
         try:
-            ssh.output(robot, ["true"], former=False)
+            ssh.output(robot, ["true"], ssh.command(robot, former=False))
         except UserError as error:
             return str(error)
         return None

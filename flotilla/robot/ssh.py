@@ -43,11 +43,11 @@ def command(robot: Robot, *, former: bool = True) -> list[str]:
     return ["ssh", *options(robot, former=former), *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)])]
 
 
-def output(robot: Robot, words: Sequence[str], *, former: bool = True) -> str:
+def output(robot: Robot, words: Sequence[str], by: Sequence[str] | None = None) -> str:
     """What a command on the robot prints, without the last line's end; what it says on stderr, as UserError, when it
-    fails, or when it lasts longer than PATIENCE_S. A program's name before its message is left out. `former`: as of
-    `options`."""
-    argv = [*command(robot, former=former), shlex.join(words)]
+    fails, or when it lasts longer than PATIENCE_S. A program's name before its message is left out. `by`: another
+    way there than `command`'s."""
+    argv = [*(by or command(robot)), shlex.join(words)]
     try:
         done = subprocess.run(
             argv, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False, timeout=PATIENCE_S

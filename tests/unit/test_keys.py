@@ -113,8 +113,8 @@ def test_an_operators_key_is_rotated_and_the_former_one_serves_until_it_is_retir
 
     asked: list[str] = []
 
-    def output(robot: Robot, words: Sequence[str], *, former: bool) -> str:
-        assert not former, "the key that is to go would let itself in"
+    def output(robot: Robot, words: Sequence[str], by: Sequence[str]) -> str:
+        assert not [word for word in by if "retired" in word], "the key that is to go would let itself in"
         asked.append(robot.name)
         if robot.name == "robot2":
             raise UserError("robot2 did not answer: Permission denied")
