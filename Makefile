@@ -120,7 +120,7 @@ requirements: | setup ## lock the Python environment anew from requirements.in
 
 ##@ Keys
 .PHONY: rotate-key revoke-key backup-keys restore-keys
-rotate-key: | setup ## a new host key for a robot, or operator's key: make rotate-key ROBOT=3 or KEY=operator, provision, then RETIRE=1 [FORCE=1]
+rotate-key: | setup ## a new key for a robot or the operator: make rotate-key ROBOT=3 or KEY=operator, provision, then RETIRE=1 [FORCE=1]
 	$(Q)$(FLOTILLA) rotate-key $(if $(value KEY),$(call given,KEY),$(call need,ROBOT)) $(if $(filter-out 0,$(RETIRE)),--retire) \
 	    $(if $(filter-out 0,$(FORCE)),--force)
 

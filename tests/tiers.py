@@ -21,6 +21,7 @@ LONGEST = (
     "test_boot_loader.py",
     "test_power_cuts_guest.py",
     "test_power_cuts.py",
+    "test_bad_update.py",
     "test_update.py",
     "test_assigned_apps.py",
     "test_radio_cell.py",

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flotilla.cli.command import Command, robot_argument
+
+if TYPE_CHECKING:
+    from flotilla.fleet.model import Fleet, Robot
 
 
 def _image(arguments: argparse.Namespace) -> None:
@@ -174,23 +178,44 @@ def _check_fleet(_: argparse.Namespace) -> None:
     print(inventory.summary(fleet))
 
 
+_OPERATOR = "operator"
+
+
+def _whose(text: str) -> int | str:
+    return text if text == _OPERATOR else int(text)
+
+
+_whose.__name__ = f"robot's number or {_OPERATOR!r}"  # in argparse's errors
+
+
 def _rotate_key(arguments: argparse.Namespace) -> None:
-    from flotilla.fleet import inventory, keys
-    from flotilla.robot import operator_key
+    from flotilla.fleet import inventory
 
     fleet = inventory.load_fleet()
     if arguments.whose == _OPERATOR:
-        if arguments.retire:
-            operator_key.retire(fleet, force=arguments.force)
-            print("the former operator's key is gone; robots admit the new one alone")
-        else:
-            keys.rotate_operator_key()
-            print(
-                "there is a new operator's key; bring it to all robots with `make provision`, "
-                "then `make rotate-key KEY=operator RETIRE=1`"
-            )
-        return
-    robot = inventory.robot(fleet, arguments.whose)
+        _rotate_operator_key(fleet, arguments)
+    else:
+        _rotate_host_key(fleet, inventory.robot(fleet, arguments.whose), arguments)
+
+
+def _rotate_operator_key(fleet: Fleet, arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import keys
+    from flotilla.robot import operator_key
+
+    if arguments.retire:
+        operator_key.retire(fleet, force=arguments.force)
+        print("the former operator's key is gone; robots admit the new one alone")
+    else:
+        keys.rotate_operator_key()
+        print(
+            "there is a new operator's key; bring it to all robots with `make provision`, "
+            "then `make rotate-key KEY=operator RETIRE=1`"
+        )
+
+
+def _rotate_host_key(fleet: Fleet, robot: Robot, arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import keys
+
     if arguments.retire:
         keys.retire_host_key(fleet, robot)
         print(f"{robot.name}: this computer accepts its old host key no more")
@@ -200,16 +225,6 @@ def _rotate_key(arguments: argparse.Namespace) -> None:
             f"{robot.name}: has a new host key; bring it there with `make provision ROBOT={robot.number}`, "
             f"then `make rotate-key ROBOT={robot.number} RETIRE=1`"
         )
-
-
-_OPERATOR = "operator"
-
-
-def _whose(text: str) -> int | str:
-    return text if text == _OPERATOR else int(text)
-
-
-_whose.__name__ = f"robot's number or {_OPERATOR!r}"  # in argparse's errors
 
 
 def _rotate_key_arguments(parser: argparse.ArgumentParser) -> None:

@@ -54,14 +54,14 @@ def restore(source: Path, password: Path | None) -> int:
             raise UserError(
                 f"{paths.shown(paths.KEYS)}: {', '.join(others)}: not those of the backup; move them away first"
             )
-        for file in _files(beside):
+        restored = _files(beside)
+        paths.KEYS.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for file in restored:
             file.chmod(0o600)
-        restored = len(_files(beside))
-        shutil.rmtree(paths.KEYS, ignore_errors=True)
-        beside.rename(paths.KEYS)
+            file.replace(paths.KEYS / file.name)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
-    return restored
+    return len(restored)
 
 
 def _files(directory: Path) -> list[Path]:

@@ -120,19 +120,17 @@ def operator() -> Path:
 
 def former_operator() -> Path | None:
     """The private key that robots may still want, while the new one is on the way to them."""
-    path = paths.KEYS / f"{_OPERATOR}.retired"
-    return path if path.exists() else None
+    return path if (path := _former()).exists() else None
 
 
 def rotate_operator_key() -> None:
     """A new operator's key. The former one is kept, because robots admit it until they are provisioned."""
-    if former := former_operator():
+    now, former = operator(), _former()
+    if former.exists():
         raise UserError(
             f"{paths.shown(former)}: an earlier rotation has not ended; `make provision`, then "
             "`make rotate-key KEY=operator RETIRE=1`"
         )
-    now = operator()
-    former = paths.KEYS / f"{_OPERATOR}.retired"
     now.rename(former)  # from here on whoever asks first makes a new one
     _public_file(now).rename(_public_file(former))
     operator()
@@ -144,7 +142,11 @@ def retire_operator_key() -> None:
         _remove(former)
 
 
-# ---
+def _former() -> Path:
+    return paths.KEYS / f"{_OPERATOR}.retired"
+
+
+# --- files ---
 
 
 def _remove(private: Path) -> None:

@@ -17,7 +17,7 @@ import uuid
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 from urllib.parse import quote
 
 from pydantic import BaseModel, ConfigDict, JsonValue
@@ -301,45 +301,71 @@ def _with_tools(document: dict[str, Any], lock: Lock) -> dict[str, Any]:
         for package in lock.packages
     }
     if "spdxVersion" in document:
-        relationships = document["relationships"]
-        (system,) = (it["relatedSpdxElement"] for it in relationships if it["relationshipType"] == "DESCRIBES")
+        system = _spdx_system(document)
         for package in lock.packages:
             reference = f"SPDXRef-tool-{package.name.replace('+', '.plus')}"
-            document["packages"].append(
-                {
-                    "SPDXID": reference, "name": package.name, "versionInfo": package.version,
-                    "checksums": [{"algorithm": "SHA256", "checksumValue": package.sha256}],
-                    "externalRefs": [
-                        {
-                            "referenceCategory": "PACKAGE_MANAGER", "referenceType": "purl",
-                            "referenceLocator": purls[package.name],
-                        }
-                    ],
-                    "downloadLocation": "NOASSERTION", "filesAnalyzed": False, "primaryPackagePurpose": "APPLICATION",
-                    "licenseConcluded": "NOASSERTION", "licenseDeclared": "NOASSERTION", "copyrightText": "NOASSERTION",
-                }
-            )  # fmt: skip
+            purl = {
+                "referenceCategory": "PACKAGE_MANAGER", "referenceType": "purl",
+                "referenceLocator": purls[package.name],
+            }  # fmt: skip
+            document["packages"].append(_spdx_package(reference, package) | {"externalRefs": [purl]})
             kinds = ["BUILD_TOOL_OF", *(["PACKAGE_OF"] if package.name == _BOOT_LOADER else [])]
-            relationships += [
+            document["relationships"] += [
                 {"spdxElementId": reference, "relatedSpdxElement": system, "relationshipType": kind} for kind in kinds
             ]
         return document
-    components = [
-        {
-            "type": "application", "bom-ref": f"tool/{package.name}", "name": package.name, "version": package.version,
-            "purl": purls[package.name], "hashes": [{"alg": "SHA-256", "content": package.sha256}],
-        }
+    components = {
+        package.name: _component(f"tool/{package.name}", package) | {"purl": purls[package.name]}
         for package in lock.packages
-    ]  # fmt: skip
+    }
     # CycloneDX, "formulation": what was used to make it, apart from what it consists of.
-    document["formulation"] = [{"bom-ref": "tools", "components": components}]
-    loader = next((dict(each) for each in components if each["name"] == _BOOT_LOADER), None)
-    if loader:
-        loader["bom-ref"] = f"boot-loader/{_BOOT_LOADER}"
+    document["formulation"] = [{"bom-ref": "tools", "components": list(components.values())}]
+    if _BOOT_LOADER in components:
+        loader = components[_BOOT_LOADER] | {"bom-ref": f"boot-loader/{_BOOT_LOADER}"}
         document["components"].append(loader)
-        system = document["metadata"]["component"]["bom-ref"]
-        next(it for it in document["dependencies"] if it["ref"] == system)["dependsOn"].append(loader["bom-ref"])
+        _cdx_parts(document).append(loader["bom-ref"])
     return document
+
+
+class _Named(Protocol):
+    """What a bill says of a package or an app."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def version(self) -> str: ...
+    @property
+    def sha256(self) -> str: ...
+
+
+def _spdx_package(reference: str, named: _Named) -> dict[str, Any]:
+    return {
+        "SPDXID": reference, "name": named.name, "versionInfo": named.version,
+        "checksums": [{"algorithm": "SHA256", "checksumValue": named.sha256}],
+        "downloadLocation": "NOASSERTION", "filesAnalyzed": False, "primaryPackagePurpose": "APPLICATION",
+        "licenseConcluded": "NOASSERTION", "licenseDeclared": "NOASSERTION", "copyrightText": "NOASSERTION",
+    }  # fmt: skip
+
+
+def _component(reference: str, named: _Named) -> dict[str, Any]:
+    return {
+        "type": "application", "bom-ref": reference, "name": named.name, "version": named.version,
+        "hashes": [{"alg": "SHA-256", "content": named.sha256}],
+    }  # fmt: skip
+
+
+def _spdx_system(document: dict[str, Any]) -> str:
+    """Identifier of the system that a bill describes."""
+    (system,) = (it["relatedSpdxElement"] for it in document["relationships"] if it["relationshipType"] == "DESCRIBES")
+    return str(system)
+
+
+def _cdx_parts(document: dict[str, Any]) -> list[str]:
+    """References of what the system consists of, to be added to."""
+    system = document["metadata"]["component"]["bom-ref"]
+    parts: list[str]
+    (parts,) = (it["dependsOn"] for it in document["dependencies"] if it["ref"] == system)
+    return parts
 
 
 def _sorted(value: Any) -> Any:
@@ -414,32 +440,18 @@ def with_apps(bill: str, robot: str, apps: Sequence[App]) -> str:
     identity = uuid.uuid5(uuid.NAMESPACE_OID, " ".join(words))
     if "spdxVersion" in document:
         document["documentNamespace"] = f"urn:uuid:{identity}"
-        relationships = document["relationships"]
-        (system,) = (it["relatedSpdxElement"] for it in relationships if it["relationshipType"] == "DESCRIBES")
+        relationships, system = document["relationships"], _spdx_system(document)
         for app in apps:
             reference = f"SPDXRef-app-{app.name}"
-            document["packages"].append(
-                {
-                    "SPDXID": reference, "name": app.name, "versionInfo": app.version,
-                    "checksums": [{"algorithm": "SHA256", "checksumValue": app.sha256}],
-                    "downloadLocation": "NOASSERTION", "filesAnalyzed": False, "primaryPackagePurpose": "APPLICATION",
-                    "licenseConcluded": "NOASSERTION", "licenseDeclared": "NOASSERTION", "copyrightText": "NOASSERTION",
-                }
-            )  # fmt: skip
+            document["packages"].append(_spdx_package(reference, app))
             of = {"spdxElementId": reference, "relatedSpdxElement": system, "relationshipType": "PACKAGE_OF"}
             relationships.append(of)
     else:
         document["serialNumber"] = f"urn:uuid:{identity}"
-        system = document["metadata"]["component"]["bom-ref"]
-        (depends,) = (it["dependsOn"] for it in document["dependencies"] if it["ref"] == system)
+        depends = _cdx_parts(document)
         for app in apps:
             reference = f"app/{app.name}@{app.version}"
-            document["components"].append(
-                {
-                    "type": "application", "bom-ref": reference, "name": app.name, "version": app.version,
-                    "hashes": [{"alg": "SHA-256", "content": app.sha256}],
-                }
-            )  # fmt: skip
+            document["components"].append(_component(reference, app))
             depends.append(reference)
     return json.dumps(_sorted(document), indent=1, ensure_ascii=False, sort_keys=True) + "\n"
 

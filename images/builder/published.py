@@ -8,8 +8,11 @@ import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import IO, Any
+
+import pydantic
 
 from flotilla.common import cache, host, namespace, paths, progress
 from flotilla.common.errors import UserError
@@ -26,80 +29,78 @@ _KEYS_REMEDY = (
 )
 
 
-@dataclass(frozen=True)
-class Published:
-    """A bundle as it is read, judged by nobody yet."""
+class Manifest(pydantic.BaseModel):
+    """What `bundle.manifest_of` writes."""
 
-    text: bytes
-    """Its manifest."""
-    signatures: Mapping[str, bytes]
-    """By their names in it."""
-    members: Mapping[str, str]
-    """SHA-256 of the others, but of slot.img."""
+    format: int
+    header: dict[str, str]
+    chunk_bytes: int
     chunks: list[str]
     """SHA-256 of each chunk of slot.img."""
+    bills: dict[str, str] = {}
+    """SHA-256 of the bills of materials, by their names in the bundle."""
 
-    @property
-    def manifest(self) -> dict[str, Any]:
-        manifest: dict[str, Any] = json.loads(self.text)
-        return manifest
+
+@dataclass(frozen=True)
+class Published:
+    """A bundle that is what its manifest says; who signed that is judged by nobody yet."""
+
+    text: bytes
+    """The manifest to the byte, as it is signed."""
+    manifest: Manifest
+    signatures: list[bytes]
 
 
 def verify(fleet: Fleet, file: Path) -> str:
     """Build what the bundle says it is, and compare all but who signed it. UserError with what differs, or why it is
     nothing to go by."""
     published = _read(file)
-    header = published.manifest["header"]
-    board = fleet.board(header["BOARD"])
+    header = published.manifest.header
+    board = fleet.board(header.get("BOARD", ""))
     host.check()
     namespace.check()
     signed = _signed(published, json.loads(release_keys.document(fleet.releases)), file)
     with cache.exclusive():
         made = board_build(board, fleet.releases)
-        here = json.loads(bundle.manifest_of(made.slot, bundle.bills_of(made)))
+        here = Manifest.model_validate_json(bundle.manifest_of(made.slot, bundle.bills_of(made)))
     if found := list(_differences(published.manifest, here)):
         raise UserError("\n  ".join([f"{paths.shown(file)}: is not what this checkout builds:", *found]))
     return (
         f"{paths.shown(file)}: release {header['RELEASE']} of {board.name} is what this checkout builds: slot.img, "
-        f"{progress.size(int(header['BYTES']))}, and {', '.join(sorted(here['bills']))}; signed by {', '.join(signed)}"
+        f"{progress.size(int(header['BYTES']))}, and {', '.join(sorted(here.bills))}; signed by {', '.join(signed)}"
     )
 
 
 def _read(file: Path) -> Published:
-    """UserError where the bundle contradicts itself."""
+    """UserError where the bundle is none, or contradicts itself."""
     texts: dict[str, bytes] = {}
+    chunks: list[str] = []
     try:
         with tarfile.open(file, "r:") as archive:
             for member in archive:
                 content = archive.extractfile(member)
                 if content is None:
-                    raise UserError(f"{paths.shown(file)}: {member.name}: is no file; it is no bundle")
+                    raise ValueError(f"{member.name} is no file")
                 if member.name == "slot.img":
                     chunks = list(_hashes(content))
                 else:
                     texts[member.name] = content.read()
         text = texts.pop("manifest.json")
-        signatures = {name: content for name, content in texts.items() if name.endswith(".sig")}
-        members = {
-            name: hashlib.sha256(content).hexdigest() for name, content in texts.items() if name not in signatures
-        }
-        published = Published(text, signatures, members, chunks)
-        described = published.manifest
-        intact = described["chunks"] == chunks and described.get("bills", {}) == members
-        header_board = described["header"]["BOARD"]
+        manifest = Manifest.model_validate_json(text)
     except FileNotFoundError:
         raise UserError(f"{paths.shown(file)}: no such file; give the bundle that somebody published") from None
-    except (tarfile.TarError, ValueError, KeyError, UnboundLocalError) as error:
+    except (tarfile.TarError, ValueError, KeyError) as error:
         raise UserError(f"{paths.shown(file)}: is no bundle: {error}") from error
-    if described["format"] != bundle.FORMAT:
+    if (manifest.format, manifest.chunk_bytes) != (bundle.FORMAT, bundle.CHUNK_BYTES):
         raise UserError(
-            f"{paths.shown(file)}: has format {described['format']}, this checkout makes {bundle.FORMAT}; take the "
-            "checkout that made it"
+            f"{paths.shown(file)}: has format {manifest.format} and chunks of {manifest.chunk_bytes} bytes, this "
+            f"checkout makes {bundle.FORMAT} and {bundle.CHUNK_BYTES}; take the checkout that made it"
         )
-    if not intact:
+    signatures = [texts.pop(name) for name in sorted(texts) if name.endswith(".sig")]
+    bills = {name: hashlib.sha256(content).hexdigest() for name, content in texts.items()}
+    if (manifest.chunks, manifest.bills) != (chunks, bills):
         raise UserError(f"{paths.shown(file)}: holds something else than its manifest says; get it again")
-    assert isinstance(header_board, str), "or fleet.board() says that there is none"
-    return published
+    return Published(text, manifest, signatures)
 
 
 def _hashes(content: IO[bytes]) -> Iterator[str]:
@@ -113,7 +114,7 @@ def _signed(published: Published, trusted: Mapping[str, Any], file: Path) -> lis
         text, signature = Path(scratch, "manifest.json"), Path(scratch, "signature")
         text.write_bytes(published.text)
         signed = set()
-        for content in published.signatures.values():
+        for content in published.signatures:
             signature.write_bytes(content)
             signed |= {key["name"] for key in trusted["keys"] if bundle.signed_by(text, signature, key)}
     if len(signed) < trusted["signatures"]:
@@ -124,23 +125,23 @@ def _signed(published: Published, trusted: Mapping[str, Any], file: Path) -> lis
     return sorted(signed)
 
 
-def _differences(published: Mapping[str, Any], here: Mapping[str, Any]) -> Iterator[str]:
-    theirs, ours = published["header"], here["header"]
-    for key in sorted(theirs.keys() | ours.keys()):
-        if theirs.get(key) != ours.get(key) and key != "BLOB":
+def _differences(published: Manifest, here: Manifest) -> Iterator[str]:
+    theirs, ours = published.header, here.header
+    # The hash of slot.img follows from its chunks: where those differ, they say more.
+    told = {"BLOB"} if published.chunks != here.chunks else set()
+    for key in sorted((theirs.keys() | ours.keys()) - told):
+        if theirs.get(key) != ours.get(key):
             yield f"{key}: {theirs.get(key)}, here {ours.get(key)}"
-    if published["chunk_bytes"] != here["chunk_bytes"]:
-        yield f"chunk_bytes: {published['chunk_bytes']}, here {here['chunk_bytes']}"
-        return
-    pairs = zip(published["chunks"], here["chunks"], strict=False)
-    other = [number for number, (one, another) in enumerate(pairs) if one != another]
-    parts = {name for number in other for name in _parts(theirs, number * here["chunk_bytes"], here["chunk_bytes"])}
-    if parts:
+    pairs = enumerate(zip_longest(published.chunks, here.chunks))
+    starts = [number * here.chunk_bytes for number, (one, another) in pairs if one != another]
+    if parts := {name for start in starts for name in _parts(ours, start, here.chunk_bytes)}:
         yield f"slot.img: differs in {', '.join(sorted(parts))}"
+    elif starts:
+        yield f"slot.img: is {len(published.chunks)} chunks long, here {len(here.chunks)}"
     if parts == {_PARTS["KEYS"]}:
         yield _KEYS_REMEDY
-    for name in sorted(published["bills"].keys() | here["bills"].keys()):
-        if published["bills"].get(name) != here["bills"].get(name):
+    for name in sorted(published.bills.keys() | here.bills.keys()):
+        if published.bills.get(name) != here.bills.get(name):
             yield f"{name}: differs"
 
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import subprocess
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.fleet import release_keys
 from flotilla.fleet.model import Fleet
 from images.builder import bundle, published
 from images.builder.build import board_build
@@ -93,6 +96,36 @@ def test_what_somebody_put_in_is_named(part: str, releases: Fleet, file: Path, t
     wrong = resigned(file, tmp_path / "wrong.bundle", releases, change)
     expected = f"{part}: differs" if part.startswith("sbom") else f"slot.img: differs in {part}"
     with pytest.raises(UserError, match=rf"is not what this checkout builds:\n  {expected}$"):
+        published.verify(releases, wrong)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda manifest: manifest["header"].update(BLOB="0" * 64), "BLOB: 0{64}, here [0-9a-f]{64}"),
+        (lambda manifest: manifest["chunks"].pop(), r"slot\.img: differs in initramfs, release keys"),
+        (lambda manifest: manifest["header"].update(SOME="1"), "SOME: 1, here None"),
+    ],
+    ids=["hash of the whole", "a chunk less", "one more entry"],
+)
+def test_a_manifest_that_says_something_else_is_named(
+    change: Callable[[dict[str, Any]], object], said: str, releases: Fleet, file: Path, tmp_path: Path
+) -> None:
+    """With the publisher's keys, and a slot.img that fits it. Seen to fail, the first two, where the hash was not
+    compared and the shorter list of chunks ended the comparison."""
+
+    def lie(members: dict[str, bytes]) -> None:
+        manifest = json.loads(members["manifest.json"])
+        change(manifest)
+        members["manifest.json"] = json.dumps(manifest).encode()
+        members["slot.img"] = members["slot.img"][: len(manifest["chunks"]) * bundle.CHUNK_BYTES]
+        (name,) = (name for name in members if name.endswith(".sig"))
+        sign = ["ssh-keygen", "-Y", "sign", "-q", "-n", release_keys.NAMESPACE]
+        sign += ["-f", str(paths.KEYS / "release_ed25519")]
+        members[name] = subprocess.run(sign, input=members["manifest.json"], capture_output=True, check=True).stdout
+
+    wrong = altered(file, tmp_path / "wrong.bundle", lie)
+    with pytest.raises(UserError, match=rf"is not what this checkout builds:\n  {said}$"):
         published.verify(releases, wrong)
 
 

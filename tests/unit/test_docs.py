@@ -117,13 +117,8 @@ PORT = re.compile(r"^\| (ICMP echo|(?:TCP|UDP) [\d-]+) \|", re.MULTILINE)
 
 def admitted(rules: str) -> set[str]:
     """What a robot's firewall lets in, in the words of the page."""
-    ports = re.search(r"udp dport \{ (.*) \} accept", rules)
-    assert ports
-    found = {f"UDP {port}" for port in ports[1].split(", ")} | set(
-        re.findall(r"daddr \S+ (udp) dport (\d+) accept", rules)
-    )
-    named = {each if isinstance(each, str) else f"UDP {each[1]}" for each in found}
-    named |= {f"TCP {port}" for port in re.findall(r"tcp dport (\d+) accept", rules)}
+    found = re.findall(r"(tcp|udp) dport (?:\{ (.*?) \}|(\d+)) accept", rules)
+    named = {f"{kind.upper()} {port}" for kind, several, one in found for port in (several or one).split(", ")}
     return named | ({"ICMP echo"} if "icmp type echo-request accept" in rules else set())
 
 

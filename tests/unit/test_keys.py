@@ -107,7 +107,7 @@ def test_an_operators_key_is_rotated_and_the_former_one_serves_until_it_is_retir
     assert stat.S_IMODE(former.stat().st_mode) == 0o600
     assert identities(robot) == [str(paths.KEYS / "operator_ed25519"), str(former)]
     admitted, _ = identity.render(fleet, robot)[PurePosixPath("/etc/ssh/authorized_keys/robot")]
-    assert admitted.decode().split() == [*keys.public(keys.operator()).split()], "the new one alone"
+    assert admitted.decode().split() == keys.public(keys.operator()).split(), "the new one alone"
     with pytest.raises(UserError, match=r"operator_ed25519\.retired: an earlier rotation has not ended; .*RETIRE=1"):
         keys.rotate_operator_key()
 
