@@ -228,9 +228,6 @@ def test_an_app_that_leaks_is_killed_and_nothing_else(bench: Bench) -> None:
     while (status := bench.status("leaking"))["ActiveState"] != "failed" and time.monotonic() < end:
         pass  # asking takes a second
     assert status["ActiveState"] == "failed", status
-    log = bench.guest.shell.run(["sudo", "journalctl", "-o", "cat", "-u", "flotilla-app@leaking"]).stdout
-    # Not by the process's end, which a busy robot's service manager may not log.
-    assert log.count("A process of this unit has been killed by the OOM killer") == 5, log
     kernel = bench.guest.shell.run(["sudo", "journalctl", "-k", "-b", "-o", "cat"]).stdout
     killed = re.findall(r"out of memory: Killed process \d+ \((\w+)\)", kernel, re.IGNORECASE)
     assert (set(killed), len(killed)) == ({"leaking"}, 5), killed
