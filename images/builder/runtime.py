@@ -17,7 +17,7 @@ from images.builder import pool, runtime_stage, toolchain, tools
 from images.builder.lock import read_lock
 
 SOURCE = paths.PROJECT / "runtime"
-LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libsystemd0", "libyaml-0-2")
+LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libnettle8", "libsystemd0", "libyaml-0-2")
 """Packages whose libraries its programs load; robots have them from images/packages/robot.list."""
 WARNINGS = ("-Wall", "-Wextra", "-Werror")
 """Compiler options for code that is written by hand."""

@@ -37,6 +37,26 @@ int udp_read_addresses(struct fl_block *block, const char *parameter, struct fl_
     return FL_OK;
 }
 
+int udp_check_keys(struct fl_block *block, const char *parameter, const char *keys, int64_t length,
+                   struct fl_strings addresses)
+{
+    if (!*keys)
+        return FL_OK;
+    if (length > UDP_LONGEST - AUTHENTICATION_TRAILER)
+        return fl_fail(block, "parameter length: with keys a payload has at most %d bytes",
+                       UDP_LONGEST - AUTHENTICATION_TRAILER);
+    for (size_t i = 0; i < addresses.count; i++) {
+        struct in_addr address;
+        if (udp_read_address(block, parameter, addresses.value[i], &address) != FL_OK)
+            return FL_FAILED;
+        if (address.s_addr == INADDR_ANY || address.s_addr == INADDR_BROADCAST)
+            return fl_fail(block,
+                           "parameter keys: %s is many computers, and each has a key of its own; name them by %s",
+                           addresses.value[i], parameter);
+    }
+    return FL_OK;
+}
+
 /* The datagrams that a receiver accepts: of its length, from one of its senders. The kernel applies the filter before a
  * datagram joins the queue, so others take neither its room nor the time of a step. The packet begins with the UDP
  * header (linux/Documentation/networking/filter.rst). */
@@ -102,6 +122,19 @@ int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, con
     return udp_sockets_open(&receiver->sockets, block, 1, local, port, interface);
 }
 
+int udp_receiver_authenticate(struct udp_receiver *receiver, struct fl_block *block, const char *keys, int64_t port)
+{
+    uint8_t key[AUTHENTICATION_KEY];
+    for (size_t i = 0; i < receiver->from_count; i++) {
+        if (authentication_read_key(block, keys, receiver->from[i], AUTHENTICATION_FROM, key) != FL_OK)
+            return FL_FAILED;
+        authentication_receiver_begin(&receiver->authentication[i], key, (uint16_t)port);
+    }
+    explicit_bzero(key, sizeof key);
+    receiver->authenticated = true;
+    return FL_OK;
+}
+
 int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns)
 {
     int64_t arrived_ns = now_ns - (wall_ns - stamp_ns);
@@ -147,6 +180,31 @@ static size_t rank_of(const struct udp_receiver *receiver, const struct sockaddr
     return rank;
 }
 
+/* Whether a datagram is from who it says, and new. Who cannot know yet what proves that is told. */
+static bool authentic(struct udp_receiver *receiver, size_t rank, const struct sockaddr_in *sender, const void *bytes,
+                      const uint8_t trailer[AUTHENTICATION_TRAILER])
+{
+    uint8_t challenge[AUTHENTICATION_CHALLENGE];
+    if (!receiver->authenticated)
+        return true;
+    switch (authentication_judge(&receiver->authentication[rank], bytes, receiver->length - AUTHENTICATION_TRAILER,
+                                 trailer, challenge)) {
+    case AUTHENTICATION_GOOD:
+        return true;
+    case AUTHENTICATION_FORGED:
+        receiver->forged++;
+        return false;
+    case AUTHENTICATION_UNANSWERED: /* if it gets lost, the next message asks for another */
+        sendto(receiver->sockets.fd[0], challenge, sizeof challenge, MSG_DONTWAIT, (const struct sockaddr *)sender,
+               sizeof *sender);
+        break;
+    case AUTHENTICATION_REPLAYED:
+        break;
+    }
+    receiver->replayed++;
+    return false;
+}
+
 bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, int *budget)
 {
     if (*budget == UDP_BURST)
@@ -154,11 +212,13 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
     while ((*budget)-- > 0) {
         _Alignas(struct cmsghdr) char control[CMSG_SPACE(sizeof(struct __kernel_timespec))];
         struct sockaddr_in sender = {0};
-        struct iovec part = {bytes, receiver->length};
+        uint8_t trailer[AUTHENTICATION_TRAILER];
+        size_t behind = receiver->authenticated ? sizeof trailer : 0;
+        struct iovec parts[] = {{bytes, receiver->length - behind}, {trailer, behind}};
         struct msghdr message = {.msg_name = &sender,
                                  .msg_namelen = sizeof sender,
-                                 .msg_iov = &part,
-                                 .msg_iovlen = 1,
+                                 .msg_iov = parts,
+                                 .msg_iovlen = 2,
                                  .msg_control = control,
                                  .msg_controllen = sizeof control};
         int64_t before_ns = fl_now_ns();
@@ -168,6 +228,8 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
         if (got < 0)
             break;
         size_t rank = rank_of(receiver, &sender);
+        if (!authentic(receiver, rank, &sender, bytes, trailer))
+            continue;
         int64_t stamp_ns = read_stamp(&message);
         int64_t now_ns = fl_now_ns(), wall_ns = now_ns + wall_less_monotonic_ns();
         int64_t came_ns = udp_arrival_ns(stamp_ns, wall_ns, now_ns, receiver->emptied_ns);

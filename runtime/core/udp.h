@@ -2,6 +2,7 @@
 #ifndef FLOTILLA_CORE_UDP_H
 #define FLOTILLA_CORE_UDP_H
 
+#include "authentication.h"
 #include "udp_sockets.h"
 
 enum {
@@ -22,6 +23,13 @@ enum {
         FL_PARAMETER(type, interface, .default_value = "",                                                             \
                      .summary = "network interface that datagrams have to pass, such as wlan0, which may come later; " \
                                 "empty: any")
+
+/* Key file of a block whose messages are authenticated: member and parameter. */
+#define UDP_KEYS_MEMBER const char *keys
+#define UDP_KEYS_PARAMETER(type)                                                                                       \
+    FL_PARAMETER(type, keys, .default_value = "",                                                                      \
+                 .summary = "file with keys shared with other computers, absolute or among the service's "             \
+                            "credentials; empty: messages are not authenticated")
 
 /* Further members and parameters of a block that receives. */
 #define UDP_RECEIVER_MEMBERS                                                                                           \
@@ -45,6 +53,11 @@ int udp_read_address(struct fl_block *block, const char *parameter, const char *
 int udp_read_addresses(struct fl_block *block, const char *parameter, struct fl_strings strings,
                        struct in_addr *addresses);
 
+/* For `configure` of a block with `keys`: whether they are possible with these addresses, which are those of a
+ * parameter, and with a payload of that length. */
+int udp_check_keys(struct fl_block *block, const char *parameter, const char *keys, int64_t length,
+                   struct fl_strings addresses);
+
 /* --- receiving --- */
 
 struct udp_receiver {
@@ -59,6 +72,10 @@ struct udp_receiver {
     uint32_t lost;      /* datagrams lost by the count of the kernel, for any reason */
     uint32_t dropped;   /* of these, lost because the queue was full */
     uint32_t refused;   /* of these, refused: of another length, or not from one of `from` */
+    bool authenticated;
+    struct authentication_receiver authentication[FL_SENDERS];
+    uint32_t forged;   /* datagrams without a proof of their sender */
+    uint32_t replayed; /* datagrams that were repeated or overtaken, or are not proven to be new yet */
 };
 
 #define UDP_RECEIVER_OUTPUTS                                                                                           \
@@ -72,6 +89,10 @@ struct udp_receiver {
 /* For `configure`: check the addresses among the parameters. */
 int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_strings from);
 
+/* For `start`, after udp_receiver_open(): take only messages that the senders authenticate by the keys of a file. The
+ * block's `length` is that of the payload, and udp_receiver_open() was given the trailer's, too. */
+int udp_receiver_authenticate(struct udp_receiver *receiver, struct fl_block *block, const char *keys, int64_t port);
+
 int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
                       const char *interface, struct fl_strings from, double failover, size_t length);
 
@@ -82,10 +103,10 @@ void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *
  * time. So the result is limited to the possible interval, from when the queue was last empty until now. */
 int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns);
 
-/* Take the next datagram of the right length from one of the senders. Each call takes one off `budget`, which is
- * UDP_BURST at the begin of a step; with a budget of 0 there is none. `arrived_ns` is when the kernel received it
- * (SO_TIMESTAMPNS, see socket(7)), on CLOCK_MONOTONIC; for the first moments after the first socket of a computer asked
- * for time stamps, when it was read. */
+/* Take the next datagram of the right length from one of the senders: `bytes` has room for the payload. Each call takes
+ * one off `budget`, which is UDP_BURST at the begin of a step; with a budget of 0 there is none. `arrived_ns` is when
+ * the kernel received it (SO_TIMESTAMPNS, see socket(7)), on CLOCK_MONOTONIC; for the first moments after the first
+ * socket of a computer asked for time stamps, when it was read. */
 bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, int *budget);
 
 void udp_receiver_close(struct udp_receiver *receiver);

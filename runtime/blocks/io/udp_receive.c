@@ -7,6 +7,10 @@
  * ones, and `age` grows. Datagrams of another length or sender are counted in `refused`, those lost to a full queue in
  * `dropped`. With several senders, one is listened to once those before it have been silent for longer than
  * `failover`. The interface and the local address may come later, go, and come back.
+ *
+ * With `keys` each message carries 40 bytes more, which prove that it is the sender's and new. A message without that
+ * is not taken; it is counted in `forged`, or in `replayed` if it came before. The first message after a start of
+ * either side is such a one, too: the sender is asked, with 40 bytes, to prove that its messages are new.
  */
 #include "core/udp.h"
 
@@ -16,6 +20,7 @@
 
 struct udp_receive {
     UDP_RECEIVER_MEMBERS;
+    UDP_KEYS_MEMBER;
     int64_t length;
     int take;
     double timeout;
@@ -25,6 +30,7 @@ enum take { NEWEST, IN_ORDER };
 
 static const struct fl_parameter parameters[] = {
     UDP_RECEIVER_PARAMETERS(struct udp_receive),
+    UDP_KEYS_PARAMETER(struct udp_receive),
     FL_PARAMETER(struct udp_receive, length, .min = 1, .max = UDP_LONGEST, .unit = "B",
                  .summary = "payload of a datagram; one of another length is refused"),
     FL_PARAMETER(struct udp_receive, take, .default_value = "newest", .choices = "newest|in-order",
@@ -35,9 +41,14 @@ static const struct fl_parameter parameters[] = {
 static const struct fl_port outputs[] = {
     FL_SENSOR_OUTPUTS,
     UDP_RECEIVER_OUTPUTS,
+    {.name = "forged", .type = FL_UINT32, .width = 1, .summary = "datagrams that no key of `keys` proves"},
+    {.name = "replayed",
+     .type = FL_UINT32,
+     .width = 1,
+     .summary = "datagrams that came again or late, or came before their sender proved them new"},
 };
 
-enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, SENDER, DATA };
+enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, SENDER, FORGED, REPLAYED, DATA };
 
 struct state {
     struct udp_receiver receiver;
@@ -49,7 +60,8 @@ struct state {
 static int configure(struct fl_block *block)
 {
     const struct udp_receive *udp = block->parameters;
-    if (udp_receiver_check(block, udp->local_address, udp->from) != FL_OK)
+    if (udp_receiver_check(block, udp->local_address, udp->from) != FL_OK ||
+        udp_check_keys(block, "from", udp->keys, udp->length, udp->from) != FL_OK)
         return FL_FAILED;
     return fl_add_output(block, (struct fl_port){.name = "data",
                                                  .type = FL_UINT8,
@@ -65,8 +77,11 @@ static int start(struct fl_block *block)
     state->scratch = fl_allocate(block, (size_t)udp->length);
     if (!state->scratch)
         return FL_FAILED;
-    return udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from,
-                             udp->failover, (size_t)udp->length);
+    size_t length = (size_t)udp->length + (*udp->keys ? AUTHENTICATION_TRAILER : 0);
+    if (udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from,
+                          udp->failover, length) != FL_OK)
+        return FL_FAILED;
+    return *udp->keys ? udp_receiver_authenticate(&state->receiver, block, udp->keys, udp->port) : FL_OK;
 }
 
 /* Take the newest datagram that waits, or the next one. When it arrived; 0: none did. */
@@ -106,6 +121,8 @@ static int step(struct fl_block *block)
         take(block);
     fl_sensor_outputs(&state->sensor, block, FLAG, true, udp->timeout);
     udp_receiver_outputs(&state->receiver, block, DROPPED);
+    FL_OUT(block, FORGED, uint32_t) = state->receiver.forged;
+    FL_OUT(block, REPLAYED, uint32_t) = state->receiver.replayed;
     return FL_OK;
 }
 

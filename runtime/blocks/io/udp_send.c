@@ -5,7 +5,11 @@
  * Failure: No step waits. A datagram that the network does not take (interface or route missing, queue full) is
  * counted in `failed`, and not sent again. The interface and the local address may come later, go, and come back.
  * While `withhold` is 1 the block is silent, so that receivers fail over.
+ *
+ * With `keys` each message carries 40 bytes more, which prove to its receiver that it is from here and new. A receiver
+ * takes messages from the second on: to the first it answers with what the next ones have to repeat.
  */
+#define _GNU_SOURCE
 #include "core/udp.h"
 
 #include <arpa/inet.h>
@@ -18,6 +22,7 @@ struct udp_send {
     struct fl_strings address;
     int64_t port;
     UDP_LOCAL_MEMBERS;
+    UDP_KEYS_MEMBER;
     int64_t length;
     bool broadcast;
     int64_t dscp;
@@ -27,6 +32,7 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct udp_send, address, .summary = "IPv4 address to send to, or several"),
     FL_PARAMETER(struct udp_send, port, .min = 1, .max = 65535, .summary = "UDP port to send to"),
     UDP_LOCAL_PARAMETERS(struct udp_send),
+    UDP_KEYS_PARAMETER(struct udp_send),
     FL_PARAMETER(struct udp_send, length, .min = 1, .max = UDP_LONGEST, .unit = "B",
                  .summary = "payload of a datagram; it has to fit one frame"),
     FL_PARAMETER(struct udp_send, broadcast, .default_value = "false",
@@ -60,6 +66,8 @@ struct state {
     struct udp_sockets sockets;
     uint32_t sequence; /* sequence in the step before; 0: nothing has come yet, or the input has no wire */
     struct sockaddr_in to[FL_SENDERS];
+    struct authentication_sender authentication[FL_SENDERS];
+    uint8_t *message; /* payload, and a trailer for each address in turn; NULL: not authenticated */
 };
 
 static int configure(struct fl_block *block)
@@ -76,6 +84,10 @@ static int configure(struct fl_block *block)
             return fl_fail(block, "parameter address: %s is a broadcast address; allow it by broadcast: true",
                            udp->address.value[i]);
     }
+    if (*udp->keys && udp->broadcast)
+        return fl_fail(block, "parameter keys: a broadcast goes to many computers, and each has a key of its own");
+    if (udp_check_keys(block, "address", udp->keys, udp->length, udp->address) != FL_OK)
+        return FL_FAILED;
     return fl_add_input(block, (struct fl_port){.name = "data",
                                                 .type = FL_UINT8,
                                                 .width = (uint32_t)udp->length,
@@ -104,6 +116,21 @@ static bool prepare(int fd, const void *context)
            setsockopt(fd, IPPROTO_IP, IP_TOS, &service, sizeof service) == 0;
 }
 
+static int begin_sessions(struct fl_block *block, const struct in_addr *to)
+{
+    const struct udp_send *udp = block->parameters;
+    struct state *state = block->state;
+    uint8_t key[AUTHENTICATION_KEY];
+    for (size_t i = 0; i < udp->address.count; i++) {
+        if (authentication_read_key(block, udp->keys, to[i], AUTHENTICATION_TO, key) != FL_OK)
+            return FL_FAILED;
+        authentication_sender_begin(&state->authentication[i], key, (uint16_t)udp->port);
+    }
+    explicit_bzero(key, sizeof key);
+    state->message = fl_allocate(block, (size_t)udp->length + AUTHENTICATION_TRAILER);
+    return state->message ? FL_OK : FL_FAILED;
+}
+
 static int start(struct fl_block *block)
 {
     const struct udp_send *udp = block->parameters;
@@ -118,9 +145,37 @@ static int start(struct fl_block *block)
         if (!udp->broadcast && refuse_broadcast(block, &state->to[i], udp->address.value[i]) != FL_OK)
             return FL_FAILED;
     }
+    if (*udp->keys && begin_sessions(block, to) != FL_OK)
+        return FL_FAILED;
     state->sockets.prepare = prepare;
     state->sockets.context = udp;
     return udp_sockets_open(&state->sockets, block, udp->address.count, local, 0, udp->interface);
+}
+
+/* Take what the receiver wants to be answered; of what others send, a few each step. */
+static void take_challenges(int fd, struct authentication_sender *authentication)
+{
+    enum { MOST = 4 };
+    uint8_t bytes[AUTHENTICATION_CHALLENGE + 1];
+    ssize_t got;
+    for (int i = 0; i < MOST && (got = recv(fd, bytes, sizeof bytes, MSG_DONTWAIT)) >= 0; i++)
+        authentication_challenged(authentication, bytes, (size_t)got);
+}
+
+static ssize_t send_to(struct fl_block *block, size_t i)
+{
+    const struct udp_send *udp = block->parameters;
+    struct state *state = block->state;
+    const void *bytes = block->in[DATA];
+    size_t length = (size_t)udp->length;
+    if (state->message) {
+        take_challenges(state->sockets.fd[i], &state->authentication[i]);
+        authentication_sign(&state->authentication[i], state->message, length);
+        bytes = state->message;
+        length += AUTHENTICATION_TRAILER;
+    }
+    return sendto(state->sockets.fd[i], bytes, length, MSG_DONTWAIT, (const struct sockaddr *)&state->to[i],
+                  sizeof state->to[i]);
 }
 
 static int step(struct fl_block *block)
@@ -131,10 +186,10 @@ static int step(struct fl_block *block)
     state->sequence = FL_IN(block, SEQUENCE, uint32_t);
     if (FL_IN(block, WITHHOLD, uint8_t) || (before && before == state->sequence))
         return FL_OK;
+    if (state->message)
+        memcpy(state->message, block->in[DATA], (size_t)udp->length);
     for (size_t i = 0; i < udp->address.count; i++) {
-        ssize_t sent = sendto(state->sockets.fd[i], block->in[DATA], (size_t)udp->length, MSG_DONTWAIT,
-                              (const struct sockaddr *)&state->to[i], sizeof state->to[i]);
-        if (sent == udp->length)
+        if (send_to(block, i) >= 0)
             FL_OUT(block, SENT, uint32_t)++;
         else
             FL_OUT(block, FAILED, uint32_t)++;

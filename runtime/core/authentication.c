@@ -1,0 +1,202 @@
+#define _GNU_SOURCE
+#include "authentication.h"
+
+#include <arpa/inet.h>
+#include <errno.h>
+#include <nettle/memops.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/random.h>
+#include <time.h>
+
+enum { NUMBER = 8, TAG = 16 };
+/* Where the numbers of a trailer and of a challenge lie, and what follows them. */
+enum { SESSION = 0, COUNTER = 8, ANSWER = 16, SIGNED = 24 };
+enum kind { MESSAGE = 'M', CHALLENGE = 'C' };
+
+/* --- keys --- */
+
+enum { ADDRESS = 15, DIGITS = 2 * AUTHENTICATION_KEY, LINE = 256, PATH = 512 };
+
+static bool read_digits(const char *text, uint8_t key[AUTHENTICATION_KEY])
+{
+    if (strlen(text) != DIGITS || strspn(text, "0123456789abcdef") != DIGITS)
+        return false;
+    for (size_t i = 0; i < AUTHENTICATION_KEY; i++) {
+        const char digits[] = {text[2 * i], text[2 * i + 1], 0};
+        key[i] = (uint8_t)strtoul(digits, NULL, 16);
+    }
+    return true;
+}
+
+/* Whether the line is that of `address`; a line that is none of the format is not. */
+static bool read_line(const char *line, struct in_addr address, enum authentication_direction direction,
+                      uint8_t key[AUTHENTICATION_KEY])
+{
+    char name[ADDRESS + 1], digits[2][DIGITS + 1];
+    struct in_addr found;
+    return sscanf(line, "%15s %64s %64s", name, digits[AUTHENTICATION_TO], digits[AUTHENTICATION_FROM]) == 3 &&
+           inet_pton(AF_INET, name, &found) == 1 && found.s_addr == address.s_addr &&
+           read_digits(digits[direction], key);
+}
+
+int authentication_read_key(struct fl_block *block, const char *file, struct in_addr address,
+                            enum authentication_direction direction, uint8_t key[AUTHENTICATION_KEY])
+{
+    char path[PATH], line[LINE], text[INET_ADDRSTRLEN];
+    const char *directory = getenv("CREDENTIALS_DIRECTORY");
+    bool found = false;
+    snprintf(path, sizeof path, "%s%s%s",
+             *file == '/' ? ""
+             : directory  ? directory
+                          : "/etc/flotilla",
+             *file == '/' ? "" : "/", file);
+    FILE *stream = fopen(path, "re");
+    if (!stream)
+        return fl_fail(block, "parameter keys: %s: %s", path, strerror(errno));
+    while (!found && fgets(line, sizeof line, stream))
+        found = read_line(line, address, direction, key);
+    fclose(stream);
+    explicit_bzero(line, sizeof line);
+    if (!found)
+        return fl_fail(block, "parameter keys: %s has no key for %s; each line is an address and two keys of %d digits",
+                       path, inet_ntop(AF_INET, &address, text, sizeof text), DIGITS);
+    return FL_OK;
+}
+
+/* --- both sides --- */
+
+static void put(uint8_t *bytes, uint64_t number)
+{
+    for (int i = 0; i < NUMBER; i++)
+        bytes[i] = (uint8_t)(number >> 8 * i);
+}
+
+static uint64_t get(const uint8_t *bytes)
+{
+    uint64_t number = 0;
+    for (int i = 0; i < NUMBER; i++)
+        number |= (uint64_t)bytes[i] << 8 * i;
+    return number;
+}
+
+static void tag_of(const struct hmac_sha256_ctx *key, enum kind kind, uint16_t port, const uint8_t *payload,
+                   size_t length, const uint8_t *numbers, uint8_t tag[TAG])
+{
+    const uint8_t head[] = {(uint8_t)kind, (uint8_t)port, (uint8_t)(port >> 8)};
+    struct hmac_sha256_ctx hash = *key;
+    hmac_sha256_update(&hash, sizeof head, head);
+    if (length)
+        hmac_sha256_update(&hash, length, payload);
+    hmac_sha256_update(&hash, SIGNED, numbers);
+    hmac_sha256_digest(&hash, TAG, tag);
+}
+
+/* What is never drawn twice, and what nobody can guess without the key, even where a computer has just started and the
+ * kernel has gathered next to nothing by chance: the key and the clocks do it then. */
+static void draw(const uint8_t key[AUTHENTICATION_KEY], uint8_t drawn[AUTHENTICATION_KEY])
+{
+    struct {
+        uint8_t chance[AUTHENTICATION_KEY];
+        struct timespec clocks[2];
+    } seed;
+    struct hmac_sha256_ctx hash;
+    memset(&seed, 0, sizeof seed);                                     /* its gaps, too */
+    if (getrandom(seed.chance, sizeof seed.chance, GRND_NONBLOCK) < 0) /* waiting would hold up the task */
+        getrandom(seed.chance, sizeof seed.chance, GRND_INSECURE);
+    clock_gettime(CLOCK_REALTIME, &seed.clocks[0]);
+    clock_gettime(CLOCK_MONOTONIC, &seed.clocks[1]);
+    hmac_sha256_set_key(&hash, AUTHENTICATION_KEY, key);
+    hmac_sha256_update(&hash, sizeof seed, (const uint8_t *)&seed);
+    hmac_sha256_digest(&hash, AUTHENTICATION_KEY, drawn);
+}
+
+/* --- sending --- */
+
+void authentication_sender_begin(struct authentication_sender *sender, const uint8_t key[AUTHENTICATION_KEY],
+                                 uint16_t port)
+{
+    uint8_t drawn[AUTHENTICATION_KEY];
+    draw(key, drawn);
+    *sender = (struct authentication_sender){.port = port, .session = get(drawn)};
+    hmac_sha256_set_key(&sender->key, AUTHENTICATION_KEY, key);
+}
+
+void authentication_sign(struct authentication_sender *sender, uint8_t *message, size_t length)
+{
+    uint8_t *trailer = message + length;
+    put(trailer + SESSION, sender->session);
+    put(trailer + COUNTER, ++sender->counter);
+    put(trailer + ANSWER, sender->answer);
+    tag_of(&sender->key, MESSAGE, sender->port, message, length, trailer, trailer + SIGNED);
+}
+
+bool authentication_challenged(struct authentication_sender *sender, const uint8_t *bytes, size_t length)
+{
+    uint8_t tag[TAG];
+    if (length != AUTHENTICATION_CHALLENGE || get(bytes + SESSION) != sender->session)
+        return false;
+    uint64_t counter = get(bytes + COUNTER);
+    if (counter <= sender->challenged || counter > sender->counter)
+        return false;
+    tag_of(&sender->key, CHALLENGE, sender->port, NULL, 0, bytes, tag);
+    if (!memeql_sec(tag, bytes + SIGNED, TAG))
+        return false;
+    sender->challenged = counter;
+    sender->answer = get(bytes + ANSWER);
+    return true;
+}
+
+/* --- receiving --- */
+
+void authentication_receiver_begin(struct authentication_receiver *receiver, const uint8_t key[AUTHENTICATION_KEY],
+                                   uint16_t port)
+{
+    uint8_t drawn[AUTHENTICATION_KEY];
+    draw(key, drawn);
+    *receiver = (struct authentication_receiver){.port = port};
+    hmac_sha256_set_key(&receiver->key, AUTHENTICATION_KEY, key);
+    hmac_sha256_set_key(&receiver->secret, AUTHENTICATION_KEY, drawn);
+}
+
+/* The answer that is wanted of a session that is not taken. */
+static uint64_t wanted(const struct authentication_receiver *receiver, uint64_t session)
+{
+    struct hmac_sha256_ctx hash = receiver->secret;
+    uint8_t numbers[2 * NUMBER], digest[NUMBER];
+    put(numbers, session);
+    put(numbers + NUMBER, receiver->taken);
+    hmac_sha256_update(&hash, sizeof numbers, numbers);
+    hmac_sha256_digest(&hash, sizeof digest, digest);
+    return get(digest);
+}
+
+enum authentication_verdict authentication_judge(struct authentication_receiver *receiver, const uint8_t *payload,
+                                                 size_t length, const uint8_t trailer[AUTHENTICATION_TRAILER],
+                                                 uint8_t challenge[AUTHENTICATION_CHALLENGE])
+{
+    uint64_t session = get(trailer + SESSION), counter = get(trailer + COUNTER), answer = get(trailer + ANSWER);
+    bool known = receiver->taken && session == receiver->session;
+    uint8_t tag[TAG];
+    tag_of(&receiver->key, MESSAGE, receiver->port, payload, length, trailer, tag);
+    if (!memeql_sec(tag, trailer + SIGNED, TAG))
+        return AUTHENTICATION_FORGED;
+    if (known && counter <= receiver->counter)
+        return AUTHENTICATION_REPLAYED;
+    if (!known || answer != receiver->answer) {
+        uint64_t right = wanted(receiver, session);
+        if (answer != right) {
+            put(challenge + SESSION, session);
+            put(challenge + COUNTER, counter);
+            put(challenge + ANSWER, right);
+            tag_of(&receiver->key, CHALLENGE, receiver->port, NULL, 0, challenge, challenge + SIGNED);
+            return AUTHENTICATION_UNANSWERED;
+        }
+        receiver->session = session;
+        receiver->answer = answer;
+        receiver->taken++;
+    }
+    receiver->counter = counter;
+    return AUTHENTICATION_GOOD;
+}
