@@ -50,7 +50,7 @@ size: | setup ## the largest packages and files of a robot's image
 	$(Q)$(FLOTILLA) size $(call need,ROBOT)
 
 ##@ Fleet
-.PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave
+.PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave station-time
 fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4 [LINK=ibss]
 	$(Q)$(FLOTILLA) fleet up $(call need,N) $(call option,--link,LINK)
 
@@ -89,6 +89,9 @@ station-join: | setup ## put this computer's 802.11 adapter into the robots' ad 
 
 station-leave: | setup ## take it out of the cell, and put everything back: make station-leave [ADAPTER=wlan0]
 	$(Q)$(FLOTILLA) station-leave $(if $(value ADAPTER),$(call given,ADAPTER))
+
+station-time: | setup ## what this computer's chrony needs to lead the robots' time, in build/station-time [STATION=]
+	$(Q)$(FLOTILLA) station-time $(call option,--station,STATION)
 
 ##@ Apps
 .PHONY: new-app import-model deploy

@@ -424,6 +424,18 @@ def _station_join_arguments(parser: argparse.ArgumentParser) -> None:
     cell.join_arguments(parser)
 
 
+def _station_time(arguments: argparse.Namespace) -> None:
+    from flotilla.station import clock
+
+    clock.run(arguments)
+
+
+def _station_time_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import cell
+
+    cell.station_arguments(parser)
+
+
 def _station_leave(arguments: argparse.Namespace) -> None:
     from flotilla.station import cell
 
@@ -582,6 +594,8 @@ COMMANDS = (
             _station_join_arguments),
     Command("Robots", "station-leave", "take it out, and put everything back", _station_leave,
             _station_leave_arguments),
+    Command("Robots", "station-time", "write what this computer's chrony needs to lead the robots' time", _station_time,
+            _station_time_arguments),
     Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments),
     Command("Robots", "fetch", "bring a robot's recorder files to this computer", _fetch, _fetch_arguments),
     Command("Robots", "convert", "make MCAP, CSV or MAT of files of a recorder", _convert, _convert_arguments),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import apps, interfaces, keys, transport
+from flotilla.fleet import apps, interfaces, keys, message_keys, transport
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Fleet, Host, Robot
 
@@ -21,7 +21,7 @@ TASKS = PurePosixPath("/etc/flotilla/tasks")
 """Where a robot's control tasks lie on it."""
 _CAN = PurePosixPath("etc/systemd/network/20-can.network.j2")
 """Rendered for each CAN interface of the robot, with its name in the file's."""
-_PRIVATE = {"ssh_host_ed25519_key.j2": 0o600}
+_PRIVATE = dict.fromkeys(("ssh_host_ed25519_key.j2", f"{message_keys.CREDENTIAL}.j2", "chrony.keys.j2"), 0o600)
 """Modes of templates whose result is not for everyone."""
 
 
@@ -66,6 +66,8 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "revoked_keys": keys.revoked(),
         "host_public_key": host_keys[robot.name],
         "host_private_key": keys.of_robot(robot).read_text(),
+        "message_key": message_keys.between,
+        "time_key": message_keys.time_key,
         "operator_key": keys.public(keys.operator()),
         # Stable, and not to be guessed back to anything (machine-id(5)).
         "machine_id": hashlib.sha256(f"machine-id {host_keys[robot.name]}".encode()).hexdigest()[:32],

@@ -65,6 +65,18 @@ def robot(fleet: Fleet, number: int) -> Robot:
     return fleet.robots[number]
 
 
+def station(fleet: Fleet, name: str | None, where: Path) -> Host:
+    """The station that was named, or the only one; `where` the inventory is."""
+    names = [station.name for station in fleet.stations]
+    if name is None and len(names) == 1:
+        return fleet.stations[0]
+    for each in fleet.stations:
+        if each.name == name:
+            return each
+    what = f"stations: {name} is none" if name else "say which station this computer is: STATION="
+    raise UserError(f"{paths.shown(where)}: {what}; there are {', '.join(names) or 'none'}")
+
+
 def summary(fleet: Fleet) -> str:
     """One line about the fleet, one about each robot."""
     members = ", ".join(

@@ -6,6 +6,7 @@
 | `operator_ed25519` | what every robot admits; it may have a passphrase, if an agent has it |
 | `NAME_ed25519.retired` | the former one, accepted until it is retired: public of a robot, private of the operator |
 | `revoked_keys` | public host keys that nobody accepts any more, a line each with the robot's name |
+| `fleet_secret` | where keys of messages come from: message_keys.py |
 | `known_hosts` | what of that `ssh` on this computer accepts; written anew when it differs |
 """
 
@@ -74,6 +75,12 @@ def revoked() -> list[str]:
     """Public host keys that nobody accepts, whoever has them."""
     file = _revoked()
     return [" ".join(line.split()[:2]) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def revocations(robot: str) -> int:
+    """How many host keys of that name nobody accepts."""
+    file = _revoked()
+    return sum(line.split()[2] == robot for line in file.read_text().splitlines()) if file.exists() else 0
 
 
 def rotate_host_key(fleet: Fleet, robot: Robot) -> None:

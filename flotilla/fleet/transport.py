@@ -11,6 +11,7 @@ In a template, `message("state")` is the message of that name in `messages.yml`,
   {{ message("state").send("message.out") }}
 
 The inventory names the transport between tasks (`network.transport`): UDP, or DDS topics. Both carry the same bytes.
+Each message by UDP proves who sent it and that it is new.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from math import isclose
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.common.yaml_file import did_you_mean
+from flotilla.fleet.message_keys import CREDENTIAL
 from flotilla.fleet.model import STATIONS, Fleet, Host, Message, Robot
 
 _EXPEDITED = 46
@@ -83,7 +85,7 @@ class Hop:
             return _block("dds-publish", message.every, inputs, {**self._topic, "robot": self.robot.number})
         receivers = self.fleet.robots_with(message.receiver)
         to = {"address": addresses(receivers), "port": message.port, "length": message.bytes, "dscp": _EXPEDITED}
-        return _block("udp-send", message.every, inputs, to)
+        return _block("udp-send", message.every, inputs, to | {"keys": CREDENTIAL})
 
     @property
     def receive(self) -> str:
@@ -98,7 +100,7 @@ class Hop:
             return _block("dds-subscribe", 1, {}, {**self._topic, "robot": numbers, **timeout})
         self._check_port()
         come = {"port": message.port, "from": addresses(senders), "length": message.bytes, **timeout}
-        return _block("udp-receive", 1, {}, come)
+        return _block("udp-receive", 1, {}, come | {"keys": CREDENTIAL})
 
     @property
     def _topic(self) -> dict[str, object]:

@@ -13,7 +13,6 @@ from pathlib import Path
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
-from flotilla.fleet.model import Fleet, Host
 from flotilla.station import adapter
 
 _PROGRAMS = {"ip": "iproute2", "iw": "iw"}
@@ -22,7 +21,7 @@ _PROGRAMS = {"ip": "iproute2", "iw": "iw"}
 
 def join(arguments: argparse.Namespace) -> None:
     fleet = inventory.load_fleet(arguments.inventory)
-    station = _station(fleet, arguments.station, arguments.inventory)
+    station = inventory.station(fleet, arguments.station, arguments.inventory)
     ibss = fleet.network.ibss
     if not ibss:
         raise UserError(
@@ -44,18 +43,6 @@ def leave(arguments: argparse.Namespace) -> None:
     print(f"{name}: as it was before")
 
 
-def _station(fleet: Fleet, name: str | None, where: Path) -> Host:
-    """The one that was named, or the only one."""
-    names = [station.name for station in fleet.stations]
-    if name is None and len(names) == 1:
-        return fleet.stations[0]
-    for station in fleet.stations:
-        if station.name == name:
-            return station
-    what = f"stations: {name} is none" if name else "say which station this computer is: STATION="
-    raise UserError(f"{paths.shown(where)}: {what}; there are {', '.join(names) or 'none'}")
-
-
 def _as_root(*words: str) -> str:
     """What the program says that changes the adapter. UserError with its reason."""
     search = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
@@ -71,6 +58,11 @@ def _as_root(*words: str) -> str:
 
 def join_arguments(parser: argparse.ArgumentParser) -> None:
     _adapter(parser)
+    station_arguments(parser)
+
+
+def station_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which station this computer is."""
     parser.add_argument("--station", metavar="NAME", help="of the inventory, which this computer is (the only one)")
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
 

@@ -23,6 +23,7 @@ from unittest import mock
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from flotilla.common import cache, host, namespace, paths
+from flotilla.fleet import message_keys
 from flotilla.fleet.model import Board, Device, Fleet, Network, Robot
 from images.builder import card, data_partition, filesystem, initramfs, kernel
 from images.builder.build import BoardBuild, board_build
@@ -217,6 +218,7 @@ def identity_nodes(board: Board, keys: Path) -> list[Node]:
         (keys / name).write_text(private)
         (keys / f"{name}.pub").write_text(public)
     with mock.patch.object(paths, "KEYS", keys):
+        message_keys.write_secret(SECRET)
         return data_partition.nodes(fleet, measured)
 
 
@@ -230,6 +232,10 @@ def _data_partition(subject: Subject, image: Path) -> bytes:
         label="data", uuid="5b0e4a3c-6f1d-4c58-9d0a-000000000004", epoch=subject.made.lock.epoch,
     )  # fmt: skip
     return image.read_bytes()
+
+
+SECRET = bytes(32)
+"""A fleet's, which everybody can compute: a run that repeats needs the same one everywhere."""
 
 
 def ssh_key(name: str) -> tuple[str, str]:

@@ -28,13 +28,16 @@ from flotilla.updates import multicast
 
 UDP_BYTES = 20 + 8
 """IPv4 and UDP."""
+PROOF_BYTES = 40
+"""Behind a message that proves its sender (runtime/core/authentication.h)."""
 DDS_BYTES = 20 + 12 + 24 + 4 + 16 + 4
 """Before a message's bytes in a DDS topic: RTPS header, INFO_TS, DATA (DDSI-RTPS 2.1, 9.4), encapsulation, and what
 `Bytes` of runtime/idl has before its data."""
 SPDP_BYTES = 450
 """An announcement of a DDS program, about: parameters of the participant, with its host's and its process's name."""
 SPDP_NS = 28_000_000_000
-NTP_BYTES = 48
+NTP_BYTES = 48 + 4 + 16
+"""With number and code of the key, AES-CMAC (RFC 8573)."""
 NTP_NS = 64_000_000_000
 """chrony's longest interval, `maxpoll 6`, which it reaches once clocks agree."""
 IGPS_BYTES = 16
@@ -197,6 +200,7 @@ def _sent(
             else tuple(members[each] for each in to if each in members)
         )
         packet = UDP_BYTES + int(parameters.get("length", message.bytes if message else 0))
+        packet += PROOF_BYTES if parameters.get("keys") else 0
         deadline = message.deadline_ms if message else None
         yield Flow(name, robot, receivers, packet, every, to_all, deadline, woken(port, receivers))
     for _, parameters, every in _blocks(task, "dds-publish"):

@@ -99,7 +99,11 @@ def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
     argv = ["ip", "netns", "exec", task["computer"], "flotilla-run", "--statistics", str(out / "statistics.json")]
     if "blocks" in task:
         argv += ["--blocks", task["blocks"]]
-    environment = os.environ | {"CYCLONEDDS_URI": f"file://{task['cyclonedds']}"} if "cyclonedds" in task else None
+    environment = dict(os.environ)
+    if "cyclonedds" in task:
+        environment["CYCLONEDDS_URI"] = f"file://{task['cyclonedds']}"
+    if "credentials" in task:
+        environment["CREDENTIALS_DIRECTORY"] = task["credentials"]
     with (out / "log").open("wb") as log:
         return subprocess.Popen([*argv, task["file"]], stdout=log, stderr=log, env=environment, cwd=out)
 

@@ -21,7 +21,7 @@ import yaml
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity, inventory
+from flotilla.fleet import identity, inventory, message_keys
 from flotilla.fleet.model import Board, Fleet, Host
 from flotilla.station import telemetry
 from images.builder import runtime
@@ -148,6 +148,7 @@ def second(described: Fleet) -> Host:
 def _rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
     """Files of each robot by its name and their path; keys are made in `keys`."""
     with mock.patch.object(paths, "KEYS", keys):
+        message_keys.write_secret(subject.SECRET)
         return {
             robot.name: {str(path): content for path, (content, _) in identity.render(fleet, robot).items()}
             for robot in fleet.robots.values()
@@ -230,11 +231,16 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
     for robot in described.robots.values():
         configuration = f"{directory}/{robot.name}-cyclonedds.xml"
         there[configuration] = brought[robot.name]["/etc/flotilla/cyclonedds.xml"]
+        credentials = f"{directory}/{robot.name}"
+        there[f"{credentials}/{message_keys.CREDENTIAL}"] = brought[robot.name][
+            f"/etc/flotilla/{message_keys.CREDENTIAL}"
+        ]
         for name in robot.control_tasks:
             called = name + STANDBY if name in robot.standby else name
             file = f"{directory}/{called}.yml"
             there[file] = changed(name, brought[robot.name][_path(name)], plan.changes)
-            tasks.append({"name": called, "computer": robot.name, "file": file, "cyclonedds": configuration})
+            task = {"name": called, "computer": robot.name, "file": file}
+            tasks.append(task | {"cyclonedds": configuration, "credentials": credentials})
     events = [asdict(event) for event in plan.events]
     if plan.stranger:
         shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]

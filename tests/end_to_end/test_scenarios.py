@@ -297,8 +297,19 @@ def test_strangers_are_refused_and_counted(flights: Callable[[str], Flight]) -> 
     last = flight.steps[-1]
     steps = flight.statistics["valves"]["steps"]
     print(f"refused {last['refused']} until the station was gone, in {steps} steps; lost {flight.lost()}")
-    assert last["refused"] > 0.9 * len(flight.steps)
+    assert last["refused"] > 0.5 * len(flight.steps)
     assert {record["refused"] for record in flights("udp").steps} == {0}
+
+
+def test_forged_and_replayed_commands_are_refused_and_counted(flights: Callable[[str], Flight]) -> None:
+    """With the right robot's address, port and length: a command as recorded, with a bit altered, and noise."""
+    flight = flights("strangers")
+    last = flight.steps[-1]
+    print(f"forged {last['forged']}, replayed {last['replayed']}; lost {flight.lost()}")
+    assert last["forged"] > 1.8 * last["replayed"] > 0.2 * len(flight.steps)
+    for record in flights("udp").steps:
+        assert record["forged"] == 0
+        assert record["replayed"] <= 1  # the first message of all, before the robots knew each other
 
 
 def test_a_second_station_hears_the_same_and_disturbs_nobody(flights: Callable[[str], Flight]) -> None:

@@ -41,9 +41,10 @@ def test_robots_differ_where_they_should(fleet: Fleet) -> None:
     three, four = (identity.render(fleet, fleet.robots[number]) for number in (3, 4))
     differing = {str(path) for path in three | four if three.get(path) != four.get(path)}
     assert differing == {
-        "/etc/chrony/chrony.conf", "/etc/flotilla/cyclonedds.xml", "/etc/hostname", "/etc/machine-id",
-        "/etc/ssh/ssh_host_ed25519_key", "/etc/ssh/ssh_host_ed25519_key.pub", "/etc/systemd/network/10-fleet.network",
-        "/etc/udev/rules.d/70-robot.rules",
+        "/etc/chrony/chrony.conf", "/etc/chrony/chrony.keys", "/etc/flotilla/cyclonedds.xml",
+        "/etc/flotilla/message-keys", "/etc/hostname", "/etc/machine-id",
+        "/etc/ssh/ssh_host_ed25519_key", "/etc/ssh/ssh_host_ed25519_key.pub",
+        "/etc/systemd/network/10-fleet.network", "/etc/udev/rules.d/70-robot.rules",
     }  # fmt: skip
 
 

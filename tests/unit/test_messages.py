@@ -316,7 +316,8 @@ _RECORDED = {
     "/robot1/valves/report": (
         "flotilla.ValvesReport",
         "step:UINT64 sensed_ns:INT64 navigation_ns:INT64 control_ns:INT64 mapping_ns:INT64 valves_ns:INT64 "
-        "now_ns:INT64 offset_ns:INT64 valves:BOOL[] controller:UINT32 good:BOOL refused:UINT32",
+        "now_ns:INT64 offset_ns:INT64 valves:BOOL[] controller:UINT32 good:BOOL refused:UINT32 "
+        "forged:UINT32 replayed:UINT32",
     ),
     "/robot3/control/report": (
         "flotilla.ControlReport",

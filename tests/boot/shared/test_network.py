@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 
-from flotilla.fleet import identity
+from flotilla.fleet import identity, message_keys
 from flotilla.fleet.model import Fleet
 from tests.boot.guests import call, sh
-from tests.boot.shared.probes import firewall
+from tests.boot.shared.probes import firewall, time_server
 from tests.conftest import RobotGuest
 
 
@@ -42,3 +42,15 @@ def test_firewall_admits_the_fleet_alone(robot: RobotGuest, fleet: Fleet) -> Non
     opened = call(robot, firewall, str(inside), dds, "insert rule inet flotilla input accept")
     everything = open_for_fleet | {"tcp 2323", "udp 2323"}
     assert set(opened["outside"]) == everything, f"with an open firewall only {opened} came through: a blind probe"
+
+
+def test_nobody_without_the_key_tells_the_time(robot: RobotGuest, fleet: Fleet) -> None:
+    """By a neighbour with another robot's address. Seen to fail for a configuration whose servers have no key."""
+    other = next(each for each in fleet.robots.values() if each != robot.robot)
+    key = message_keys.time_key(robot.robot, other)
+    found = call(robot, time_server, str(other.address), str(robot.robot.address), f"{key}\n", timeout=300)
+    for kind in ("none", "wrong"):
+        answers, taken = found[kind]
+        assert answers >= time_server.ENOUGH
+        assert taken == 0, f"{kind}: {taken} of {answers} taken"
+    assert found["right"][1] >= time_server.ENOUGH - 1

@@ -1,0 +1,78 @@
+"""Keys by which computers of a fleet authenticate their messages, one for each pair and direction, and their time.
+
+All come from the fleet's secret, which no robot has: the file `fleet_secret` in `paths.KEYS`, 64 hexadecimal digits,
+made when first needed. A robot's card has the keys of its own messages alone, so who takes one robot can speak for no
+other. Revoking a robot's host key gives it, and the others towards it, new keys. What a message proves is in
+runtime/core/authentication.h.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import secrets
+from pathlib import Path
+
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import keys
+from flotilla.fleet.model import Host
+
+CREDENTIAL = "message-keys"
+"""The file with a robot's keys, among the credentials of its control tasks' services."""
+_DIGITS = 64
+
+
+def secret_file() -> Path:
+    return paths.KEYS / "fleet_secret"
+
+
+def between(sender: Host, receiver: Host) -> str:
+    """The key of messages from one computer to another, 64 hexadecimal digits."""
+    one, other = (f"{host.name} {keys.revocations(host.name)}" for host in (sender, receiver))
+    return hmac.new(_secret(), f"messages from {one} to {other}".encode(), hashlib.sha256).hexdigest()
+
+
+def time_key(one: Host, other: Host) -> str:
+    """The key of NTP messages between two computers, either way: a line of chrony.keys(5), number, type and key."""
+    both = sorted([one, other], key=lambda host: host.name)
+    number = 1 + int.from_bytes(hashlib.sha256(" ".join(host.name for host in both).encode()).digest()[:4]) % (
+        2**32 - 1
+    )
+    names = " and ".join(f"{host.name} {keys.revocations(host.name)}" for host in both)
+    key = hmac.new(_secret(), f"time between {names}".encode(), hashlib.sha256).hexdigest()
+    return f"{number} AES128 HEX:{key[:32].upper()}"
+
+
+def write_secret(secret: bytes) -> None:
+    """Make the file, unless there is one; whole or not at all."""
+    file = secret_file()
+    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    beside = file.with_name(f".{file.name}.{os.getpid()}")
+    beside.unlink(missing_ok=True)
+    with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:
+        stream.write(secret.hex() + "\n")
+    try:
+        os.link(beside, file)
+    except FileExistsError:
+        pass  # another process was first
+    finally:
+        beside.unlink()
+
+
+def _secret() -> bytes:
+    file = secret_file()
+    if not file.exists():
+        write_secret(secrets.token_bytes(_DIGITS // 2))
+    text = file.read_text().strip()
+    try:
+        secret = bytes.fromhex(text)
+    except ValueError:
+        secret = b""
+    if len(secret) != _DIGITS // 2:
+        raise UserError(
+            f"{paths.shown(file)}: is not {_DIGITS} hexadecimal digits; restore it by `make restore-keys`, or remove "
+            "it and provision all robots"
+        )
+    return secret

@@ -1,0 +1,113 @@
+"""Messages that prove who sent them, against Python's own HMAC, byte by byte as runtime/core/authentication.h says."""
+
+from __future__ import annotations
+
+import hmac
+import socket
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.running import PATIENCE, Task, free_port, running, watching
+
+pytestmark = pytest.mark.clock
+
+KEY = bytes(range(32))
+NUMBERS = struct.Struct("<QQQ")
+"""Session, counter, answer or challenge."""
+PAYLOAD = b"valve"
+TASK = """
+period: 10 ms
+priority: 0
+blocks:
+  udp:
+    type: {type}
+"""
+RECEIVER = (
+    TASK.format(type="udp-receive") + "    parameters: {{ port: {port}, from: 127.0.0.1, length: 5, keys: {keys} }}\n"
+)
+SENDER = TASK.format(type="udp-send") + (
+    "    in: {{ data: [118, 97, 108, 118, 101] }}\n"
+    "    parameters: {{ address: 127.0.0.1, port: {port}, length: 5, keys: {keys} }}\n"
+)
+RECEIVED = "udp.data,udp.sequence,udp.forged,udp.replayed"
+
+
+def tag(kind: bytes, port: int, signed: bytes) -> bytes:
+    return hmac.digest(KEY, kind + struct.pack("<H", port) + signed, "sha256")[:16]
+
+
+def message(port: int, session: int, counter: int, answer: int) -> bytes:
+    signed = PAYLOAD + NUMBERS.pack(session, counter, answer)
+    return signed + tag(b"M", port, signed)
+
+
+def challenge(port: int, session: int, counter: int, value: int) -> bytes:
+    signed = NUMBERS.pack(session, counter, value)
+    return signed + tag(b"C", port, signed)
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Path:
+    file = tmp_path / "message-keys"
+    file.write_text(f"# one computer\n127.0.0.1 {KEY.hex()} {KEY.hex()}\n")
+    return file
+
+
+@pytest.fixture
+def started(flotilla_run: Path, tmp_path: Path, keys: Path) -> Callable[..., object]:
+    def start(text: str, port: int, watched: str = "") -> object:
+        return running([flotilla_run, *watching(watched)], tmp_path / "task.yml", text.format(port=port, keys=keys))
+
+    return start
+
+
+def test_a_block_takes_what_python_signs(started: Callable[..., object]) -> None:
+    """Seen to fail with another port in what is signed."""
+    port, session = free_port(), 0x0123456789ABCDEF
+    with (
+        started(RECEIVER, port, RECEIVED) as task,  # type: ignore[attr-defined]
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        assert isinstance(task, Task)
+        sender.settimeout(PATIENCE)
+        next(task.rows())  # the port is open
+        sender.connect(("127.0.0.1", port))
+        sender.send(message(port, session, 1, 0))
+        answered = sender.recv(100)
+        _, _, value = NUMBERS.unpack(answered[: NUMBERS.size])
+        assert answered == challenge(port, session, 1, value)
+        assert task.until(lambda row: row["replayed"] == 1)["sequence"] == 0
+        sender.send(message(port, session, 2, value))
+        row = task.until(lambda row: row["sequence"] == 1)
+        assert bytes(row["data"]) == PAYLOAD
+        sender.send(message(port, session, 2, value))
+        task.until(lambda row: row["replayed"] == 2)
+        sender.send(message(port + 1, session, 3, value))
+        assert task.until(lambda row: row["forged"] == 1)["sequence"] == 1
+
+
+def test_a_block_signs_what_python_takes(started: Callable[..., object]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.settimeout(PATIENCE)
+        receiver.bind(("127.0.0.1", 0))
+        port = receiver.getsockname()[1]
+        with started(SENDER, port) as task:  # type: ignore[attr-defined]
+            assert isinstance(task, Task)
+            first, sender = receiver.recvfrom(100)
+            session, counter, answer = NUMBERS.unpack(first[len(PAYLOAD) :][: NUMBERS.size])
+            assert (first, counter, answer) == (message(port, session, 1, 0), 1, 0)
+            receiver.sendto(challenge(port, session, counter, 42)[:-1] + b"?", sender)
+            receiver.sendto(challenge(port, session, counter, 4711), sender)
+            before = 1
+            for _ in range(100):
+                following = receiver.recv(100)
+                _, counter, answer = NUMBERS.unpack(following[len(PAYLOAD) :][: NUMBERS.size])
+                assert following == message(port, session, counter, answer)
+                assert (counter, answer in (0, 4711)) == (before + 1, True)
+                before = counter
+                if answer:
+                    break
+            assert answer == 4711
