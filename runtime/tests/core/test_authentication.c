@@ -99,24 +99,29 @@ static void refuses_other_keys_and_ports(void **state)
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
 }
 
-/* Seen to fail when a session keeps its challenge. */
-static void refuses_an_earlier_session(void **state)
+static void begin_another_session(void)
 {
-    struct message recorded[3] = {next(), next(), next()};
-    struct authentication_sender earlier = sender;
-    for (int i = 0; i < 2; i++)
-        assert_int_equal(judge(recorded[i]), AUTHENTICATION_GOOD); /* and the third was kept back */
     authentication_sender_begin(&sender, key, PORT);
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
     assert_true(answer());
     assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
-    for (int i = 0; i < 3; i++) {
-        assert_int_equal(judge(recorded[i]), AUTHENTICATION_UNANSWERED);
-        assert_false(answer()); /* it is not of this session */
-        assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
-    }
-    assert_true(authentication_challenged(&earlier, challenge, sizeof challenge)); /* only who has the key can answer */
+}
+
+/* Messages that answer the right challenge, recorded and kept back until the next session has begun. Seen to fail with
+ * `taken = 1` for `taken++`. */
+static void refuses_an_earlier_session(void **state)
+{
     (void)state;
+    for (int session = 0; session < 3; session++) {
+        struct message recorded[3] = {next(), next(), next()};
+        assert_int_equal(judge(recorded[0]), AUTHENTICATION_GOOD);
+        begin_another_session();
+        for (int i = 0; i < 3; i++) {
+            assert_int_equal(judge(recorded[i]), AUTHENTICATION_UNANSWERED);
+            assert_false(answer()); /* it is not of this session */
+            assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
+        }
+    }
 }
 
 static void refuses_what_an_earlier_receiver_took(void **state)

@@ -4,6 +4,7 @@
 
 #include "core/authentication.h"
 #include "core/service.h"
+#include "seccomp.h"
 
 #include <sys/stat.h>
 
@@ -139,6 +140,24 @@ static void flood(int attacker, const char *port)
         send_to(attacker, port, nonsense, sizeof nonsense);
 }
 
+/* Sending, asking, answering and refusing are for the step: none of it may block. Seen to fail with recv() that waits.
+ */
+static void steps_do_not_block(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = receiver(port, "newest"), *send = sender(port);
+    int attacker = bare(ROBOT, 0);
+    testbed_step(send);
+    flood(attacker, port);
+    steps_under_seccomp(receive, 2); /* refuses, and asks */
+    steps_under_seccomp(send, 2);    /* answers; what they change is lost, but not what the network has */
+    steps_under_seccomp(receive, 2);
+    close(attacker);
+    testbed_end(send);
+    testbed_end(receive);
+}
+
 /* They share its step's budget of 64 datagrams. */
 static void a_flood_does_not_hide_the_sender(void **state)
 {
@@ -216,8 +235,8 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(carries_from_the_second_message_on), cmocka_unit_test(refuses_what_is_forged_or_replayed),
-        cmocka_unit_test(a_flood_does_not_hide_the_sender),   cmocka_unit_test(refuses_who_can_have_no_key),
-        cmocka_unit_test(refuses_to_start_without_a_key),
+        cmocka_unit_test(a_flood_does_not_hide_the_sender),   cmocka_unit_test(steps_do_not_block),
+        cmocka_unit_test(refuses_who_can_have_no_key),        cmocka_unit_test(refuses_to_start_without_a_key),
     };
     stay_on_one_processor();
     return cmocka_run_group_tests(tests, begin, end);
