@@ -134,7 +134,8 @@ def test_each_threat_has_a_test_or_is_not_defended() -> None:
     rows = [line.split(" | ") for line in THREATS.read_text().partition("## Threats")[2].splitlines()[4:]]
     assert len(rows) > 10
     for who, attempt, result, test in rows:
-        named = re.findall(r"`(tests/\S+)::(\w+)`", test)
+        named = re.findall(r"`((?:runtime/)?tests/\S+)::(\w+)`", test)
         assert named or "**not defended**" in result, f"{who} | {attempt}"
         for file, name in named:
-            assert f"\ndef {name}(" in (paths.PROJECT / file).read_text(), f"{file}::{name}"
+            language = "static void" if file.endswith(".c") else "def"
+            assert f"\n{language} {name}(" in (paths.PROJECT / file).read_text(), f"{file}::{name}"
