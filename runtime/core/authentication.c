@@ -81,14 +81,39 @@ static uint64_t get(const uint8_t *bytes)
     return number;
 }
 
-static void tag_of(const struct hmac_sha256_ctx *key, enum kind kind, uint16_t port, const uint8_t *payload,
-                   size_t length, const uint8_t *numbers, uint8_t tag[TAG])
+static void begin_hash(struct hmac_sha256_ctx *hash, enum kind kind, uint16_t port)
 {
     const uint8_t head[] = {(uint8_t)kind, (uint8_t)port, (uint8_t)(port >> 8)};
-    struct hmac_sha256_ctx hash = *key;
-    hmac_sha256_update(&hash, sizeof head, head);
-    if (length)
-        hmac_sha256_update(&hash, length, payload);
+    hmac_sha256_update(hash, sizeof head, head);
+}
+
+static void set_keys(const uint8_t key[AUTHENTICATION_KEY], uint16_t port, struct chacha_poly1305_ctx *messages,
+                     struct hmac_sha256_ctx *challenges)
+{
+    uint8_t derived[CHACHA_POLY1305_KEY_SIZE];
+    hmac_sha256_set_key(challenges, AUTHENTICATION_KEY, key);
+    struct hmac_sha256_ctx hash = *challenges;
+    begin_hash(&hash, MESSAGE, port);
+    hmac_sha256_digest(&hash, sizeof derived, derived);
+    chacha_poly1305_set_key(messages, derived);
+    explicit_bzero(derived, sizeof derived);
+}
+
+static void tag_message(const struct chacha_poly1305_ctx *messages, const uint8_t *payload, size_t length,
+                        const uint8_t *numbers, uint8_t tag[TAG])
+{
+    struct chacha_poly1305_ctx cipher = *messages;
+    chacha_poly1305_set_nonce(&cipher, numbers); /* the session, and the lower half of the counter */
+    chacha_poly1305_update(&cipher, length, payload);
+    chacha_poly1305_update(&cipher, SIGNED, numbers);
+    chacha_poly1305_digest(&cipher, TAG, tag);
+}
+
+static void tag_challenge(const struct hmac_sha256_ctx *challenges, uint16_t port, const uint8_t *numbers,
+                          uint8_t tag[TAG])
+{
+    struct hmac_sha256_ctx hash = *challenges;
+    begin_hash(&hash, CHALLENGE, port);
     hmac_sha256_update(&hash, SIGNED, numbers);
     hmac_sha256_digest(&hash, TAG, tag);
 }
@@ -120,16 +145,20 @@ void authentication_sender_begin(struct authentication_sender *sender, const uin
     uint8_t drawn[AUTHENTICATION_KEY];
     draw(key, drawn);
     *sender = (struct authentication_sender){.port = port, .session = get(drawn)};
-    hmac_sha256_set_key(&sender->key, AUTHENTICATION_KEY, key);
+    set_keys(key, port, &sender->messages, &sender->challenges);
 }
 
 void authentication_sign(struct authentication_sender *sender, uint8_t *message, size_t length)
 {
     uint8_t *trailer = message + length;
+    if (sender->counter == UINT32_MAX) { /* a nonce must not come twice */
+        sender->session++;
+        sender->counter = sender->answer = sender->challenged = 0;
+    }
     put(trailer + SESSION, sender->session);
     put(trailer + COUNTER, ++sender->counter);
     put(trailer + ANSWER, sender->answer);
-    tag_of(&sender->key, MESSAGE, sender->port, message, length, trailer, trailer + SIGNED);
+    tag_message(&sender->messages, message, length, trailer, trailer + SIGNED);
 }
 
 bool authentication_challenged(struct authentication_sender *sender, const uint8_t *bytes, size_t length)
@@ -140,7 +169,7 @@ bool authentication_challenged(struct authentication_sender *sender, const uint8
     uint64_t counter = get(bytes + COUNTER);
     if (counter <= sender->challenged || counter > sender->counter)
         return false;
-    tag_of(&sender->key, CHALLENGE, sender->port, NULL, 0, bytes, tag);
+    tag_challenge(&sender->challenges, sender->port, bytes, tag);
     if (!memeql_sec(tag, bytes + SIGNED, TAG))
         return false;
     sender->challenged = counter;
@@ -156,7 +185,7 @@ void authentication_receiver_begin(struct authentication_receiver *receiver, con
     uint8_t drawn[AUTHENTICATION_KEY];
     draw(key, drawn);
     *receiver = (struct authentication_receiver){.port = port};
-    hmac_sha256_set_key(&receiver->key, AUTHENTICATION_KEY, key);
+    set_keys(key, port, &receiver->messages, &receiver->challenges);
     hmac_sha256_set_key(&receiver->secret, AUTHENTICATION_KEY, drawn);
 }
 
@@ -179,7 +208,7 @@ enum authentication_verdict authentication_judge(struct authentication_receiver 
     uint64_t session = get(trailer + SESSION), counter = get(trailer + COUNTER), answer = get(trailer + ANSWER);
     bool known = receiver->taken && session == receiver->session;
     uint8_t tag[TAG];
-    tag_of(&receiver->key, MESSAGE, receiver->port, payload, length, trailer, tag);
+    tag_message(&receiver->messages, payload, length, trailer, tag);
     if (!memeql_sec(tag, trailer + SIGNED, TAG))
         return AUTHENTICATION_FORGED;
     if (known && counter <= receiver->counter)
@@ -190,7 +219,7 @@ enum authentication_verdict authentication_judge(struct authentication_receiver 
             put(challenge + SESSION, session);
             put(challenge + COUNTER, counter);
             put(challenge + ANSWER, right);
-            tag_of(&receiver->key, CHALLENGE, receiver->port, NULL, 0, challenge, challenge + SIGNED);
+            tag_challenge(&receiver->challenges, receiver->port, challenge, challenge + SIGNED);
             return AUTHENTICATION_UNANSWERED;
         }
         receiver->session = session;

@@ -4,13 +4,16 @@
  *
  *   payload | session uint64 | counter uint64 | answer uint64 | tag, 16 bytes
  *
- * `session` is drawn when the sender begins, and `counter` counts its messages from 1. `tag` is HMAC-SHA-256-128
- * (RFC 2104, RFC 4868) over 'M', the receiver's port (uint16) and all before the tag. A receiver does not know whether
- * a session it has not heard of is new or recorded. So it takes no message of it, and answers with a challenge:
+ * `session` is drawn when the sender begins, and `counter` counts its messages from 1. `tag` is that of
+ * ChaCha20-Poly1305 (RFC 8439) for all before it as associated data, and no text. Its nonce is the session and the
+ * counter's lower half. Its key is HMAC-SHA-256 (RFC 2104) of the shared one over 'M' and the receiver's port (uint16).
+ * A receiver does not know whether a session it has not heard of is new or recorded. So it takes no message of it, and
+ * answers with a challenge:
  *
  *   session uint64 | counter uint64 | challenge uint64 | tag, 16 bytes
  *
- * `counter` is that of the message that it answers, and `tag` is over 'C' instead. The sender repeats the newest
+ * `counter` is that of the message that it answers. `tag` is HMAC-SHA-256-128 (RFC 4868) by the shared key over 'C',
+ * the receiver's port and all before the tag: the same counter may be asked for twice. The sender repeats the newest
  * challenge as `answer` in all of its messages from then on, and the receiver takes them, each counter once and in
  * ascending order. Nothing has to survive a restart, on neither side. A payload is not encrypted.
  */
@@ -19,6 +22,7 @@
 
 #include <flotilla/block.h>
 #include <netinet/in.h>
+#include <nettle/chacha-poly1305.h>
 #include <nettle/hmac.h>
 
 enum {
@@ -41,7 +45,8 @@ int authentication_read_key(struct fl_block *block, const char *file, struct in_
 /* --- sending --- */
 
 struct authentication_sender {
-    struct hmac_sha256_ctx key;
+    struct chacha_poly1305_ctx messages;
+    struct hmac_sha256_ctx challenges;
     uint16_t port;
     uint64_t session;
     uint64_t counter;
@@ -53,7 +58,8 @@ struct authentication_sender {
 void authentication_sender_begin(struct authentication_sender *sender, const uint8_t key[AUTHENTICATION_KEY],
                                  uint16_t port);
 
-/* Write the trailer behind the payload of `length` bytes. */
+/* Write the trailer behind the payload of `length` bytes. A session has 2³² − 1 messages, which are 497 days of 100 a
+ * second; then a new one begins. */
 void authentication_sign(struct authentication_sender *sender, uint8_t *message, size_t length);
 
 /* Take what came back. False: it is no challenge of the receiver to this session, or an older one. */
@@ -62,7 +68,8 @@ bool authentication_challenged(struct authentication_sender *sender, const uint8
 /* --- receiving --- */
 
 struct authentication_receiver {
-    struct hmac_sha256_ctx key;
+    struct chacha_poly1305_ctx messages;
+    struct hmac_sha256_ctx challenges;
     struct hmac_sha256_ctx secret; /* of this receiver alone: its challenges cannot be guessed */
     uint16_t port;
     uint64_t taken; /* sessions taken so far: a challenge holds until the next is taken */

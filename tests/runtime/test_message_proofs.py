@@ -1,4 +1,4 @@
-"""Messages that prove who sent them, against Python's own HMAC, byte by byte as runtime/core/authentication.h says."""
+"""Messages that prove who sent them, against OpenSSL, byte by byte as runtime/core/authentication.h says."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from tests.running import PATIENCE, Task, free_port, running, watching
 
@@ -35,18 +36,19 @@ SENDER = TASK.format(type="udp-send") + (
 RECEIVED = "udp.data,udp.sequence,udp.forged,udp.replayed"
 
 
-def tag(kind: bytes, port: int, signed: bytes) -> bytes:
-    return hmac.digest(KEY, kind + struct.pack("<H", port) + signed, "sha256")[:16]
+def digest(kind: bytes, port: int, signed: bytes = b"") -> bytes:
+    return hmac.digest(KEY, kind + struct.pack("<H", port) + signed, "sha256")
 
 
 def message(port: int, session: int, counter: int, answer: int) -> bytes:
-    signed = PAYLOAD + NUMBERS.pack(session, counter, answer)
-    return signed + tag(b"M", port, signed)
+    numbers = NUMBERS.pack(session, counter, answer)
+    cipher = ChaCha20Poly1305(digest(b"M", port))
+    return PAYLOAD + numbers + cipher.encrypt(numbers[:12], b"", PAYLOAD + numbers)
 
 
 def challenge(port: int, session: int, counter: int, value: int) -> bytes:
     signed = NUMBERS.pack(session, counter, value)
-    return signed + tag(b"C", port, signed)
+    return signed + digest(b"C", port, signed)[:16]
 
 
 @pytest.fixture

@@ -178,6 +178,19 @@ static void a_message_is_no_challenge(void **state)
     assert_false(authentication_challenged(&sender, message.bytes + LENGTH, AUTHENTICATION_TRAILER));
 }
 
+/* Counters of one session would repeat its nonces. */
+static void a_session_ends(void **state)
+{
+    (void)state;
+    uint64_t before = sender.session;
+    sender.counter = UINT32_MAX - 1;
+    assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
+    assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
+    assert_true(sender.session != before);
+    assert_true(answer());
+    assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
+}
+
 static void sessions_differ(void **state)
 {
     (void)state;
@@ -200,6 +213,7 @@ int main(void)
         cmocka_unit_test_setup(an_old_challenge_changes_nothing, meet),
         cmocka_unit_test_setup(refuses_each_flipped_bit_of_a_challenge, begin),
         cmocka_unit_test_setup(a_message_is_no_challenge, meet),
+        cmocka_unit_test_setup(a_session_ends, meet),
         cmocka_unit_test_setup(sessions_differ, begin),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
