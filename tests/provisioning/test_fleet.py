@@ -132,7 +132,7 @@ DRIFT = [
         "sed -i 's/kp: .*, kd/kp: 9, kd/' /etc/flotilla/tasks/heading.yml",
         "/etc/flotilla/tasks/heading.yml has another",
     ),
-    ("robot1", "sed -i 's/ 0/ 1/' /etc/flotilla/message-keys", "/etc/flotilla/message-keys has another"),
+    ("robot1", "sed -i '$d' /etc/flotilla/message-keys", "/etc/flotilla/message-keys has another"),
     ("robot2", "nft flush ruleset", "the rules in force are others"),
     ("robot1", "rm /etc/udev/rules.d/70-robot.rules", "/etc/udev/rules.d/70-robot.rules is missing"),
     ("robot1", "ip address add 10.42.0.77/24 dev eth0", "address 10.42.0.1/24, 10.42.0.77/24"),
