@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from flotilla.common import paths
-from flotilla.fleet import identity, inventory
+from flotilla.fleet import identity, inventory, message_keys
 from flotilla.fleet.model import Fleet
 from flotilla.station import telemetry
 from flotilla.station.receiver import Receiver
@@ -101,6 +101,7 @@ def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
     (tasks / "source.yml").write_text(SOURCE)
     (tasks / "sink.yml").write_text(SINK)
     monkeypatch.setattr(paths, "TASKS", tasks)
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
     described = inventory.load_fleet(on_loopback(tmp_path / "inventory", "127.0.0."))  # as robot 1's tasks send
     robot = described.robots[1].model_copy(update={"control_tasks": ["source", "sink"]})
     # Tests at the same time do not hear each other.
@@ -117,6 +118,9 @@ def test_a_message_is_added_by_data_alone(transport: str, fleet: Fleet, flotilla
     """Seen to fail with big-endian numbers, with gaps in the layout, and with names in another order than types."""
     fleet = by(transport, fleet)
     texts = {name: task.decode() for name, task in identity.control_tasks(fleet, fleet.robots[1]).items()}
+    robot = fleet.robots[1]
+    key = message_keys.between(robot, robot)
+    (tmp_path / message_keys.CREDENTIAL).write_text(f"{robot.address} {key} {key}\n")
     (stream,) = telemetry.streams(fleet)
     assert (stream.topic, stream.length, stream.every) == ("/robot1/sink/heard", HEARD.size, 2)
     file = tmp_path / "a.mcap"
@@ -129,7 +133,7 @@ def test_a_message_is_added_by_data_alone(transport: str, fleet: Fleet, flotilla
         station.bind(("127.0.0.254", stream.port))
         station.settimeout(PATIENCE)
         for name in ("sink", "source"):
-            environment = {"CYCLONEDDS_URI": DDS_ON_LOOPBACK}
+            environment = {"CYCLONEDDS_URI": DDS_ON_LOOPBACK, "CREDENTIALS_DIRECTORY": str(tmp_path)}
             stack.enter_context(running(command, tmp_path / f"{name}.yml", texts[name], environment))
         while sum(fresh for *_, fresh, _ in datagrams) < MANY:
             datagram, (address, _) = station.recvfrom(1 << 16)

@@ -29,7 +29,7 @@ def grown(file: Path, size: int) -> Callable[[], bool]:
 def test_streams_are_what_tasks_send_to_the_station() -> None:
     streams = {stream.topic: stream for stream in telemetry.streams(inventory.load_fleet(FLEET))}
     assert {topic: (stream.address, stream.port, stream.length) for topic, stream in streams.items()} == {
-        "/robot1/valves/report": ("170.160.1.1", 5020, 81),
+        "/robot1/valves/report": ("170.160.1.1", 5020, 89),
         "/robot3/control/report": ("170.160.1.3", 5021, 98),
     }
 
