@@ -2,7 +2,9 @@
 #include "authentication.h"
 
 #include <arpa/inet.h>
+#include <endian.h>
 #include <errno.h>
+#include <nettle/base16.h>
 #include <nettle/memops.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -21,13 +23,11 @@ enum { ADDRESS = 15, DIGITS = 2 * AUTHENTICATION_KEY, LINE = 256, PATH = 512 };
 
 static bool read_digits(const char *text, uint8_t key[AUTHENTICATION_KEY])
 {
-    if (strlen(text) != DIGITS || strspn(text, "0123456789abcdef") != DIGITS)
-        return false;
-    for (size_t i = 0; i < AUTHENTICATION_KEY; i++) {
-        const char digits[] = {text[2 * i], text[2 * i + 1], 0};
-        key[i] = (uint8_t)strtoul(digits, NULL, 16);
-    }
-    return true;
+    struct base16_decode_ctx digits;
+    size_t length;
+    base16_decode_init(&digits);
+    return strlen(text) == DIGITS && base16_decode_update(&digits, &length, key, DIGITS, text) &&
+           length == AUTHENTICATION_KEY;
 }
 
 /* Whether the line is that of `address`; a line that is none of the format is not. */
@@ -69,16 +69,15 @@ int authentication_read_key(struct fl_block *block, const char *file, struct in_
 
 static void put(uint8_t *bytes, uint64_t number)
 {
-    for (int i = 0; i < NUMBER; i++)
-        bytes[i] = (uint8_t)(number >> 8 * i);
+    number = htole64(number);
+    memcpy(bytes, &number, NUMBER);
 }
 
 static uint64_t get(const uint8_t *bytes)
 {
-    uint64_t number = 0;
-    for (int i = 0; i < NUMBER; i++)
-        number |= (uint64_t)bytes[i] << 8 * i;
-    return number;
+    uint64_t number;
+    memcpy(&number, bytes, NUMBER);
+    return le64toh(number);
 }
 
 static void begin_hash(struct hmac_sha256_ctx *hash, enum kind kind, uint16_t port)

@@ -87,11 +87,17 @@ static struct filter filter_of(const struct in_addr *from, size_t count, size_t 
     return filter;
 }
 
+/* Bytes behind a payload. */
+static size_t trailer_of(const struct udp_receiver *receiver)
+{
+    return receiver->authenticated ? AUTHENTICATION_TRAILER : 0;
+}
+
 static bool prepare(int fd, const void *context)
 {
     static const int on = 1;
     const struct udp_receiver *receiver = context;
-    struct filter filter = filter_of(receiver->from, receiver->from_count, receiver->length);
+    struct filter filter = filter_of(receiver->from, receiver->from_count, receiver->length + trailer_of(receiver));
     const struct sock_fprog program = {filter.count, filter.code};
     /* The new time stamp has 64 bits on i386 too. */
     return setsockopt(fd, SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program) == 0 &&
@@ -106,23 +112,7 @@ int udp_receiver_check(struct fl_block *block, const char *local_address, struct
     return udp_read_addresses(block, "from", from, addresses);
 }
 
-int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
-                      const char *interface, struct fl_strings from, double failover, size_t length)
-{
-    struct in_addr local;
-    *receiver = (struct udp_receiver){.sockets = {.prepare = prepare, .context = receiver},
-                                      .emptied_ns = fl_now_ns(),
-                                      .from_count = from.count,
-                                      .failover_timeout = failover,
-                                      .length = length};
-    fl_failover_begin(&receiver->failover, receiver->emptied_ns);
-    if (udp_read_addresses(block, "from", from, receiver->from) != FL_OK ||
-        udp_read_address(block, "local_address", local_address, &local) != FL_OK)
-        return FL_FAILED;
-    return udp_sockets_open(&receiver->sockets, block, 1, local, port, interface);
-}
-
-int udp_receiver_authenticate(struct udp_receiver *receiver, struct fl_block *block, const char *keys, int64_t port)
+static int read_keys(struct udp_receiver *receiver, struct fl_block *block, const char *keys, int64_t port)
 {
     uint8_t key[AUTHENTICATION_KEY];
     for (size_t i = 0; i < receiver->from_count; i++) {
@@ -131,8 +121,25 @@ int udp_receiver_authenticate(struct udp_receiver *receiver, struct fl_block *bl
         authentication_receiver_begin(&receiver->authentication[i], key, (uint16_t)port);
     }
     explicit_bzero(key, sizeof key);
-    receiver->authenticated = true;
     return FL_OK;
+}
+
+int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
+                      const char *interface, struct fl_strings from, double failover, size_t length, const char *keys)
+{
+    struct in_addr local;
+    *receiver = (struct udp_receiver){.sockets = {.prepare = prepare, .context = receiver},
+                                      .emptied_ns = fl_now_ns(),
+                                      .from_count = from.count,
+                                      .failover_timeout = failover,
+                                      .length = length,
+                                      .authenticated = *keys != 0};
+    fl_failover_begin(&receiver->failover, receiver->emptied_ns);
+    if (udp_read_addresses(block, "from", from, receiver->from) != FL_OK ||
+        udp_read_address(block, "local_address", local_address, &local) != FL_OK ||
+        (*keys && read_keys(receiver, block, keys, port) != FL_OK))
+        return FL_FAILED;
+    return udp_sockets_open(&receiver->sockets, block, 1, local, port, interface);
 }
 
 int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns)
@@ -187,8 +194,7 @@ static bool authentic(struct udp_receiver *receiver, size_t rank, const struct s
     uint8_t challenge[AUTHENTICATION_CHALLENGE];
     if (!receiver->authenticated)
         return true;
-    switch (authentication_judge(&receiver->authentication[rank], bytes, receiver->length - AUTHENTICATION_TRAILER,
-                                 trailer, challenge)) {
+    switch (authentication_judge(&receiver->authentication[rank], bytes, receiver->length, trailer, challenge)) {
     case AUTHENTICATION_GOOD:
         return true;
     case AUTHENTICATION_FORGED:
@@ -213,8 +219,7 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
         _Alignas(struct cmsghdr) char control[CMSG_SPACE(sizeof(struct __kernel_timespec))];
         struct sockaddr_in sender = {0};
         uint8_t trailer[AUTHENTICATION_TRAILER];
-        size_t behind = receiver->authenticated ? sizeof trailer : 0;
-        struct iovec parts[] = {{bytes, receiver->length - behind}, {trailer, behind}};
+        struct iovec parts[] = {{bytes, receiver->length}, {trailer, trailer_of(receiver)}};
         struct msghdr message = {.msg_name = &sender,
                                  .msg_namelen = sizeof sender,
                                  .msg_iov = parts,

@@ -64,7 +64,7 @@ struct udp_receiver {
     struct udp_sockets sockets; /* one */
     struct in_addr from[FL_SENDERS];
     size_t from_count;
-    size_t length;   /* bytes of a datagram */
+    size_t length;   /* bytes of a datagram's payload */
     uint32_t sender; /* sender of the last datagram taken: its place in `from` */
     struct fl_failover failover;
     double failover_timeout;
@@ -89,12 +89,10 @@ struct udp_receiver {
 /* For `configure`: check the addresses among the parameters. */
 int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_strings from);
 
-/* For `start`, after udp_receiver_open(): take only messages that the senders authenticate by the keys of a file. The
- * block's `length` is that of the payload, and udp_receiver_open() was given the trailer's, too. */
-int udp_receiver_authenticate(struct udp_receiver *receiver, struct fl_block *block, const char *keys, int64_t port);
-
+/* `length`: of the payload. `keys`: as of UDP_KEYS_PARAMETER; with a file, only messages that it authenticates are
+ * taken. */
 int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, const char *local_address, int64_t port,
-                      const char *interface, struct fl_strings from, double failover, size_t length);
+                      const char *interface, struct fl_strings from, double failover, size_t length, const char *keys);
 
 /* Write the outputs UDP_RECEIVER_OUTPUTS, of which `dropped` is number `first`. */
 void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *block, uint32_t first);

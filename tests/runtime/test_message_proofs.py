@@ -6,6 +6,7 @@ import hmac
 import socket
 import struct
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from tests.running import PATIENCE, Task, free_port, running, watching
 
 pytestmark = pytest.mark.clock
+
+Start = Callable[..., AbstractContextManager[Task]]
 
 KEY = bytes(range(32))
 NUMBERS = struct.Struct("<QQQ")
@@ -59,21 +62,20 @@ def keys(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def started(flotilla_run: Path, tmp_path: Path, keys: Path) -> Callable[..., object]:
-    def start(text: str, port: int, watched: str = "") -> object:
+def started(flotilla_run: Path, tmp_path: Path, keys: Path) -> Start:
+    def start(text: str, port: int, watched: str = "") -> AbstractContextManager[Task]:
         return running([flotilla_run, *watching(watched)], tmp_path / "task.yml", text.format(port=port, keys=keys))
 
     return start
 
 
-def test_a_block_takes_what_python_signs(started: Callable[..., object]) -> None:
+def test_a_block_takes_what_python_signs(started: Start) -> None:
     """Seen to fail with another port in what is signed."""
     port, session = free_port(), 0x0123456789ABCDEF
     with (
-        started(RECEIVER, port, RECEIVED) as task,  # type: ignore[attr-defined]
+        started(RECEIVER, port, RECEIVED) as task,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
-        assert isinstance(task, Task)
         sender.settimeout(PATIENCE)
         next(task.rows())  # the port is open
         sender.connect(("127.0.0.1", port))
@@ -91,13 +93,12 @@ def test_a_block_takes_what_python_signs(started: Callable[..., object]) -> None
         assert task.until(lambda row: row["forged"] == 1)["sequence"] == 1
 
 
-def test_a_block_signs_what_python_takes(started: Callable[..., object]) -> None:
+def test_a_block_signs_what_python_takes(started: Start) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.settimeout(PATIENCE)
         receiver.bind(("127.0.0.1", 0))
         port = receiver.getsockname()[1]
-        with started(SENDER, port) as task:  # type: ignore[attr-defined]
-            assert isinstance(task, Task)
+        with started(SENDER, port):
             first, sender = receiver.recvfrom(100)
             session, counter, answer = NUMBERS.unpack(first[len(PAYLOAD) :][: NUMBERS.size])
             assert (first, counter, answer) == (message(port, session, 1, 0), 1, 0)

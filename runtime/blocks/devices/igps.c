@@ -62,7 +62,7 @@ static int start(struct fl_block *block)
     if (!state->reasons)
         return FL_FAILED;
     return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from,
-                             igps->failover, IGPS_BYTES);
+                             igps->failover, IGPS_BYTES, "");
 }
 
 /* Why there is no position; NULL: only that none came just now. */

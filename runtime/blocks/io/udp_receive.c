@@ -77,11 +77,8 @@ static int start(struct fl_block *block)
     state->scratch = fl_allocate(block, (size_t)udp->length);
     if (!state->scratch)
         return FL_FAILED;
-    size_t length = (size_t)udp->length + (*udp->keys ? AUTHENTICATION_TRAILER : 0);
-    if (udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from,
-                          udp->failover, length) != FL_OK)
-        return FL_FAILED;
-    return *udp->keys ? udp_receiver_authenticate(&state->receiver, block, udp->keys, udp->port) : FL_OK;
+    return udp_receiver_open(&state->receiver, block, udp->local_address, udp->port, udp->interface, udp->from,
+                             udp->failover, (size_t)udp->length, udp->keys);
 }
 
 /* Take the newest datagram that waits, or the next one. When it arrived; 0: none did. */
