@@ -49,6 +49,13 @@ def on_loopback(directory: Path, begin: str = LOOPBACK, fleet: Path = FLEET) -> 
     return directory
 
 
+def secret_in(directory: Path) -> dict[str, str]:
+    """The environment of programs that have a fleet's secret: in this folder, which is made."""
+    directory.mkdir(exist_ok=True)
+    (directory / "fleet_secret").write_text("42" * 32 + "\n")
+    return {"KEYS": str(directory)}
+
+
 @contextmanager
 def station(
     fleet: Path,

@@ -137,8 +137,8 @@ class WheeledRobot:
     def _listen(self) -> None:
         while not self._end.is_set():
             datagram = self._command.recv(100)
-            if len(datagram) == COMMAND.size:
-                self.commands.append((time.monotonic(), *COMMAND.unpack(datagram)))
+            if len(datagram) > COMMAND.size:  # a proof follows, which tests/runtime/test_two_stations.py judges
+                self.commands.append((time.monotonic(), *COMMAND.unpack(datagram[: COMMAND.size])))
 
     def _drive(self) -> None:
         step = 0

@@ -12,6 +12,7 @@ What the robot makes of commands is in docs/how-to/wheeled-robot.md.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import math
 import os
@@ -22,6 +23,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -30,8 +32,9 @@ import yaml
 from flotilla.common import paths, signals
 from flotilla.common.errors import UserError
 from flotilla.common.yaml_file import did_you_mean
-from flotilla.fleet import identity
-from flotilla.fleet.model import Fleet, Robot
+from flotilla.fleet import identity, message_keys
+from flotilla.fleet.model import Fleet, Host, Robot
+from flotilla.station.authentication import Signer
 
 TASK = "drive"
 """The control task that takes commands."""
@@ -49,6 +52,11 @@ SILENT_S = 5.0
 APART_S = 1.2
 """From the last datagram of one hold to the first of the next: the robot takes two that speak within 1 s for a
 conflict (`guard.apart` of drive.yml)."""
+EVERYWHERE = "0.0.0.0"
+"""In place of one address of this computer."""
+_LONGEST = 2048
+_AT_ONCE = 100
+"""Datagrams of robots that are taken in one tick."""
 LOCKS = paths.BUILD / "run"
 """A file for each robot that is held, locked by the program that sends to it."""
 
@@ -89,6 +97,8 @@ class Vehicle:
     robot: str
     address: str
     port: int
+    signed: bool
+    """It takes only commands that prove their sender."""
     limits: Mapping[str, tuple[float, float]]
     """Least and greatest `v` in m/s, `omega` in rad/s, `boom` in m."""
 
@@ -153,6 +163,8 @@ class _Channel:
 
     vehicle: Vehicle
     hold: _Hold | None = None
+    signer: Signer | None = None
+    """From the first hold on: nobody else needs keys."""
     sent_s: float = -math.inf
     """When the last datagram left."""
     not_before_s: float = -math.inf
@@ -162,13 +174,14 @@ class _Channel:
 
 
 class Driving:
-    """The sender. `address`: this computer's to send from; robots accept stations' only. `clock` in s, and `send` in
-    place of a socket's: for tests. As a context manager it sends by a thread of its own; else call `tick`."""
+    """The sender. `address`: this computer's to send from. Robots accept only stations', which prove who they are by
+    the keys in `paths.KEYS`. `clock` in s, and `send` in place of a socket's: for tests. As a context manager it sends
+    by a thread of its own; else call `tick`."""
 
     def __init__(
         self,
         fleet: Fleet,
-        address: str = "0.0.0.0",
+        address: str = EVERYWHERE,
         *,
         clock: Callable[[], float] = time.monotonic,
         send: Callable[[bytes, tuple[str, int]], object] | None = None,
@@ -176,6 +189,7 @@ class Driving:
     ) -> None:
         self._clock = clock
         self._locks = locks
+        self._signer = partial(_signer, fleet, address)
         self._channels = {each.robot: _Channel(each) for each in vehicles(fleet)}
         self._lock = threading.RLock()
         self._ended = threading.Event()
@@ -200,9 +214,11 @@ class Driving:
         return [channel.vehicle for channel in self._channels.values()]
 
     def take(self, robot: str, operator: Operator) -> None:
-        """Hold a robot that nobody holds; who holds it already goes on. HeldError names the holder."""
+        """Hold a robot that nobody holds; who holds it already goes on. HeldError names the holder, UserError the keys
+        that this computer lacks."""
         with self._lock:
             channel = self._channel(robot)
+            channel.signer = channel.signer or self._signer(channel.vehicle)
             if channel.hold and channel.hold.operator.id != operator.id:
                 raise HeldError(robot, channel.hold.operator.name)
             if not channel.hold:
@@ -273,12 +289,19 @@ class Driving:
     def tick(self) -> None:
         """Send what is due, a datagram to each robot at most, and end the hold of who was silent for too long."""
         with self._lock:
+            self._listen()
             for channel in self._channels.values():
                 hold, now_s = channel.hold, self._clock()
                 if hold and now_s - hold.heard_s > SILENT_S:
                     self._end(channel, f"{hold.operator.name} said nothing for {SILENT_S:g} s and commands no more")
                 elif hold and (motion := self._due(channel, now_s)[0]):
                     self._transmit(channel, hold, motion)
+
+    def hear(self, datagram: bytes, address: str) -> None:
+        """What a robot answered to a command: a challenge, which the next one meets."""
+        for channel in self._channels.values():
+            if channel.signer and channel.vehicle.address == address:
+                channel.signer.challenged(datagram)
 
     def close(self) -> None:
         """End all holds, and the thread. Robots that move are told to stop."""
@@ -299,6 +322,16 @@ class Driving:
         while not self._ended.wait(begun_s + (done + 1) / RATE_HZ - time.monotonic()):
             self.tick()
             done = max(done + 1, math.floor((time.monotonic() - begun_s) * RATE_HZ))
+
+    def _listen(self) -> None:
+        """To all that has come, within bounds."""
+        for _ in range(_AT_ONCE if self._socket else 0):
+            assert self._socket
+            try:
+                datagram, (address, _) = self._socket.recvfrom(_LONGEST)
+            except OSError:  # there is nothing more, or nobody took the last command
+                return
+            self.hear(datagram, address)
 
     def _channel(self, robot: str) -> _Channel:
         if robot not in self._channels:
@@ -346,10 +379,11 @@ class Driving:
 
     def _transmit(self, channel: _Channel, hold: _Hold, motion: Motion) -> None:
         hold.sequence = (hold.sequence + 1) % 2**32
-        values = (hold.number, hold.sequence, motion.v, motion.omega, motion.boom, motion.enable)
+        command = COMMAND.pack(hold.number, hold.sequence, motion.v, motion.omega, motion.boom, motion.enable)
         channel.sent_s = self._clock()
         try:
-            self._send(COMMAND.pack(*values), (channel.vehicle.address, channel.vehicle.port))
+            datagram = channel.signer.sign(command) if channel.signer else command
+            self._send(datagram, (channel.vehicle.address, channel.vehicle.port))
             channel.error = ""
         except OSError as error:  # it is lost, as by radio, and the next one follows
             channel.error = f"{channel.vehicle.address}: {error.strerror or error}"
@@ -368,11 +402,41 @@ def _vehicle(fleet: Fleet, robot: Robot) -> Vehicle:
         limits = {name: blocks[f"{name}_limit"]["parameters"] for name in ("v", "omega", "boom")}
         found = {name: (float(limit["min"]), float(limit["max"])) for name, limit in limits.items()}
         port = int(blocks["command"]["parameters"]["port"])
+        signed = "keys" in blocks["command"]["parameters"]
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{file}: {error}: is missing or wrong; a station reads command, in and the limits") from error
     if list(layout.items()) != list(LAYOUT.items()):
         raise UserError(f"{file}: in: {layout}: a station sends {LAYOUT}; make it the same here and in driving.py")
-    return Vehicle(robot.name, str(robot.address), port, found)
+    return Vehicle(robot.name, str(robot.address), port, signed, found)
+
+
+def _signer(fleet: Fleet, address: str, vehicle: Vehicle) -> Signer | None:
+    if not vehicle.signed:
+        return None
+    secret = message_keys.secret_file()
+    if not secret.exists():
+        raise UserError(
+            f"{paths.shown(secret)}: is missing, so {vehicle.robot} would take no command; bring it from where its "
+            "card was made, by `make backup-keys` and `make restore-keys`, or name the folder: KEYS="
+        )
+    robot = next(each for each in fleet.robots.values() if each.name == vehicle.robot)
+    return Signer(message_keys.between(_station(fleet, vehicle, address), robot), vehicle.port)
+
+
+def _station(fleet: Fleet, vehicle: Vehicle, address: str) -> Host:
+    """Which of the fleet's stations this computer is."""
+    if address == EVERYWHERE and len(fleet.stations) == 1:
+        return fleet.stations[0]
+    if address == EVERYWHERE:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # sends nothing
+            with contextlib.suppress(OSError):
+                probe.connect((vehicle.address, vehicle.port))
+            address = probe.getsockname()[0]
+    for station in fleet.stations:
+        if address == str(station.address):
+            return station
+    stations = ", ".join(f"{station.name} {station.address}" for station in fleet.stations)
+    raise UserError(f"{address}: is no station's; {vehicle.robot} obeys {stations}; give this computer one's address")
 
 
 def _socket(address: str) -> socket.socket:

@@ -63,12 +63,13 @@ def down() -> None:
 def said(there: Live, room: str) -> str:
     """How they are reached."""
     where = f"INVENTORY={paths.shown(there.inventory)}"
+    keys = f"KEYS={paths.shown(paths.KEYS)}"
     robots = ", ".join(f"{one.robot.name} at {one.address}" for one in there.robots)
     return (
         f"in room {room}: {robots}\n"
         f"commands go to UDP port {there.robots[0].command_address[1]} there; reports come to port {there.report_port} "
         f"of {there.station_address}, or of any address\n"
-        f"drive in a browser: make station {where} KEYS={paths.shown(paths.KEYS)}\n"
-        f"by keys or gamepad: make drive ROBOT=1 {where}\n"
+        f"drive in a browser: make station {where} {keys}\n"
+        f"by keys or gamepad: make drive ROBOT=1 {where} {keys}\n"
         f"watch: make top {where}    record: make record {where}    end: Ctrl-C or make wheeled-down"
     )

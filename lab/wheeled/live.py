@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
+import select
 import shutil
 import socket
 import struct
@@ -57,6 +58,8 @@ BEGIN_SECONDS = 600
 _LOOPBACK = [IPv4Network(f"127.43.{number}.0/24") for number in range(1, 255)]
 """Where this computer may have robots: several labs at once take one each."""
 _LONGEST = 65536
+_SENDERS = 16
+"""Programs that command one robot, of which answers find back."""
 _THERE = "/home/robot/plant"
 """What is brought into a guest."""
 _BEGIN = f"""
@@ -121,33 +124,54 @@ class LiveRobot:
 
 
 class Commands:
-    """Sends on what comes to the address that a robot has here, whoever it is from on this computer: QEMU takes nobody
-    but 127.0.0.1 for the station."""
+    """Carries commands to the address that a robot has here, whoever they are from on this computer, and the robot's
+    answers back: QEMU takes nobody but 127.0.0.1 for the station."""
 
     def __init__(self, address: str, port: int) -> None:
         """`port`: of 127.0.0.1, which leads to the robot."""
         self._there = ("127.0.0.1", port)
-        self._here = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._here.bind((address, COMMAND_PORT))
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._here = _datagrams(address, COMMAND_PORT)
+        self._senders: dict[tuple[str, int], socket.socket] = {}
+        """A socket towards the robot for each, by where they send from."""
+        self._end, self._ended = socket.socketpair()
+        self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        self._ended.set()
-        with suppress(OSError):  # it says so, though it wakes who receives: it is not connected
-            self._here.shutdown(socket.SHUT_RDWR)
+        self._end.close()
         self._thread.join()
-        self._here.close()
+        for each in (self._here, self._ended, *self._senders.values()):
+            each.close()
 
-    def _listen(self) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
-            while True:
-                datagram = self._here.recv(_LONGEST)
-                if self._ended.is_set():
-                    return
+    def _carry(self) -> None:
+        while True:
+            ready, _, _ = select.select([self._ended, self._here, *self._senders.values()], [], [])
+            if self._ended in ready:
+                return
+            for one in ready:
                 with suppress(ConnectionRefusedError):  # of one before, while the segment ends
-                    there.sendto(datagram, self._there)
+                    self._pass_on(one)
+
+    def _pass_on(self, one: socket.socket) -> None:
+        if one is self._here:
+            datagram, sender = one.recvfrom(_LONGEST)
+            self._towards(sender).sendto(datagram, self._there)
+        elif found := [each for each, towards in self._senders.items() if towards is one]:
+            self._here.sendto(one.recv(_LONGEST), found[0])
+
+    def _towards(self, sender: tuple[str, int]) -> socket.socket:
+        """Of many senders the one that came first is forgotten."""
+        if sender not in self._senders:
+            if len(self._senders) == _SENDERS:
+                self._senders.pop(next(iter(self._senders))).close()
+            self._senders[sender] = _datagrams("127.0.0.1", 0)
+        return self._senders[sender]
+
+
+def _datagrams(address: str, port: int) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.bind((address, port))
+    return made
 
 
 class Cable:

@@ -153,7 +153,7 @@ def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str
         f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
         f"{DIRECTORY}/guest.py": (HERE / "guest.py").read_bytes(),
     }
-    there |= {f"{DIRECTORY}/{name}.yml": tasks[name] for name in TASKS}
+    there |= {f"{DIRECTORY}/{name}.yml": _believing(tasks[name]) for name in TASKS}
     listed = []
     for course in courses:
         file = f"{DIRECTORY}/{course.name}.yml"
@@ -170,6 +170,14 @@ def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str
         "courses": listed,
     }  # fmt: skip
     return there | {f"{DIRECTORY}/session.json": json.dumps(document, sort_keys=True).encode()}
+
+
+def _believing(task: bytes) -> bytes:
+    """It takes commands without a proof: the guest's Python has no library that could make one."""
+    told = yaml.safe_load(task)
+    if taking := told["blocks"].get("command"):
+        del taking["parameters"]["keys"]
+    return yaml.safe_dump(told, sort_keys=False).encode()
 
 
 def _stream(described: Fleet) -> telemetry.Stream:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import select
+import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 
 from flotilla.station import driving, receiver, telemetry
+from flotilla.station.authentication import Signer
 from flotilla.station.driving import RATE_HZ, Driving
 from lab.qemu.timing import Deadline
 from lab.wheeled import live
@@ -32,6 +34,7 @@ class Operator:
     """Gives the station's sender the same input until told otherwise."""
 
     def __init__(self, there: Live, locks: Path) -> None:
+        """Its commands are proved by the keys that the robot's card was made with."""
         self._driving = Driving(there.fleet, there.station_address, locks=locks)
         self._says: dict[str, Any] | None = None
         self._end = threading.Event()
@@ -117,6 +120,23 @@ def test_without_commands_it_stops_and_goes_on_with_the_next(there: Live, operat
     there.until(lambda: abs(there.truth()["pose"][2]) < 0.1, PATIENCE_S, "it looks ahead")
     operator.say()
     wait_at_rest(there)
+
+
+def test_who_has_no_key_does_not_move_it(there: Live, operator: Operator) -> None:
+    """From the station's address: commands without a proof, and by another key. They neither move it nor disturb its
+    operator. Seen to fail without `keys` in drive.yml."""
+    heard = there.report()["command"]
+    before = there.truth()["pose"]
+    signer = Signer("17" * 32, there.robots[0].command_address[1])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for sequence in range(50):
+            command = driving.COMMAND.pack(4711, sequence + 1, 0, 1.0, 0, True)
+            for datagram in (command, signer.sign(command), command + bytes(40)):
+                stranger.sendto(datagram, there.robots[0].command_address)
+    there.until(lambda: there.report()["command"] > heard + 5, PATIENCE_S, "it hears its operator")
+    report = there.report()
+    assert (report["alive"], report["conflict"], report["other"]) == (True, False, 0), report
+    assert there.truth()["pose"] == pytest.approx(before, abs=0.01)
 
 
 def test_it_stops_before_the_wall_that_its_scanner_sees(there: Live, operator: Operator) -> None:

@@ -131,7 +131,7 @@ ELSEWHERE = {
     ),
     "ssh -L 8080:127.0.0.1:8080 station": "needs a second computer",
     **dict.fromkeys(
-        ("make drive ROBOT=5", "make drive ROBOT=1 INVENTORY=build/wheeled/station"),
+        ("make drive ROBOT=5", "make drive ROBOT=1 INVENTORY=build/wheeled/station KEYS=build/wheeled/keys"),
         "needs a robot on wheels; runtime/test_drive.py has one by datagrams",
     ),
     **dict.fromkeys(

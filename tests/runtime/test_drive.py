@@ -28,9 +28,11 @@ from flotilla.station import inputs, telemetry
 from flotilla.station.driving import COMMAND, Motion
 from lab.wheeled import by_wires
 from tests.running import PATIENCE
-from tests.station import LOOPBACK
+from tests.station import LOOPBACK, secret_in
 
 ROBOT, STATION = LOOPBACK + "1", LOOPBACK + "254"
+KEYS = "keys"
+"""The fleet's, beside its inventory."""
 INTERVAL_S = 0.1
 Sent = tuple[int, int, Motion]
 """Number of the operator, sequence, motion."""
@@ -43,6 +45,7 @@ def fleet(tmp_path: Path) -> Path:
     shutil.copytree(by_wires.INVENTORY, made)
     for file in (made / "robots.yml", made / "group_vars" / "all.yml"):
         file.write_text(file.read_text().replace("10.43.0.", LOOPBACK))
+    secret_in(tmp_path / KEYS)
     return made
 
 
@@ -67,7 +70,7 @@ class Robot:
         next_s, step = time.monotonic(), 0
         while not self._ended.is_set():
             if select.select([self._socket], [], [], max(0.0, next_s - time.monotonic()))[0]:
-                number, sequence, v, omega, boom, enable = COMMAND.unpack(self._socket.recv(100))
+                number, sequence, v, omega, boom, enable = COMMAND.unpack(self._socket.recv(100)[: COMMAND.size])
                 self.commands.append((number, sequence, Motion(v, omega, boom, enable)))
             if time.monotonic() >= next_s:
                 step, next_s = step + 10, time.monotonic() + INTERVAL_S
@@ -139,7 +142,7 @@ class Terminal:
         self.process = subprocess.Popen(
             [*argv, *options], cwd=paths.PROJECT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
             preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),
-            env=os.environ | {"TERM": "xterm", "BUILD": str(build), "COLUMNS": "200"},
+            env=os.environ | {"TERM": "xterm", "BUILD": str(build), "COLUMNS": "200", "KEYS": str(fleet.parent / KEYS)},
         )  # fmt: skip
         os.close(theirs)
         self.said = ""
@@ -295,7 +298,7 @@ def test_a_keyboard_needs_a_terminal(fleet: Path, tmp_path: Path) -> None:
         text=True,
         timeout=PATIENCE,
         check=False,
-        env=os.environ | {"BUILD": str(tmp_path)},
+        env=os.environ | {"BUILD": str(tmp_path), "KEYS": str(fleet.parent / KEYS)},
     )
     assert done.returncode == 1
     assert "keyboard: standard input is no terminal; run it in one, or give INPUT=gamepad" in done.stderr

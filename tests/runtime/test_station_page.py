@@ -27,7 +27,7 @@ from tests.browser import Browser, Page
 from tests.figures import PROPERTY
 from tests.running import PATIENCE
 from tests.runtime.test_param import Running
-from tests.station import ADDRESS, decoded, on_loopback, station
+from tests.station import ADDRESS, decoded, on_loopback, secret_in, station
 from tests.station_page import Station, WheeledRobot, connected, until
 
 WHEELED = Path("lab/wheeled/inventory")
@@ -109,7 +109,7 @@ def there(flotilla_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 @pytest.fixture(scope="module")
 def environment(there: Path) -> dict[str, str]:
-    return {"PATH": f"{there}:{os.environ['PATH']}", "KEYS": str(there), "BUILD": str(there / "build")}
+    return {"PATH": f"{there}:{os.environ['PATH']}", "BUILD": str(there / "build")} | secret_in(there)
 
 
 @pytest.fixture(scope="module")

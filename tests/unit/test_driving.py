@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hmac
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -10,7 +11,9 @@ from typing import Any
 
 import pytest
 
+from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.fleet import message_keys
 from flotilla.fleet.model import Fleet
 from flotilla.station import driving
 from flotilla.station.driving import Driving, HeldError, Motion, Operator, Refused
@@ -29,6 +32,7 @@ class Bench:
     fleet: Fleet
     now_s: float = 100.0
     sent: list[tuple[float, int, int, Motion]] = field(default_factory=list)
+    datagrams: list[bytes] = field(default_factory=list)
     lost: OSError | None = None
 
     def __post_init__(self) -> None:
@@ -38,7 +42,8 @@ class Bench:
         assert to == ("10.43.0.1", 5030)
         if self.lost:
             raise self.lost
-        number, sequence, v, omega, boom, enable = driving.COMMAND.unpack(datagram)
+        number, sequence, v, omega, boom, enable = driving.COMMAND.unpack(datagram[: driving.COMMAND.size])
+        self.datagrams.append(datagram)
         self.sent.append((self.now_s, number, sequence, Motion(v, omega, boom, enable)))
 
     def passes(self, seconds: float, operator: Operator | None = None, motion: Motion = REST) -> None:
@@ -60,7 +65,9 @@ def fleet() -> Fleet:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, fleet: Fleet) -> Iterator[Bench]:
+def bench(tmp_path: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+    message_keys.write_secret(bytes(32))
     bench = Bench(tmp_path / "run", fleet)
     yield bench
     bench.driving.close()
@@ -259,3 +266,35 @@ def test_robots_that_cannot_be_driven_are_refused(bench: Bench) -> None:
     with pytest.raises(UserError, match="rove: is no robot that can be driven; did you mean rover"):
         bench.driving.take("rove", ANNA)
     assert [state.robot for state in bench.driving.states] == [ROVER]
+
+
+def test_without_the_fleets_secret_nobody_can_hold_it(bench: Bench) -> None:
+    message_keys.secret_file().unlink()
+    with pytest.raises(UserError, match=r"fleet_secret: is missing, so rover would take no command; .*KEYS="):
+        bench.driving.take(ROVER, ANNA)
+    assert bench.driving.state(ROVER).holder is None
+
+
+def test_a_computer_that_is_no_station_is_refused(bench: Bench, fleet: Fleet) -> None:
+    other = Driving(fleet, "127.0.0.1", send=lambda *_: None, locks=bench.locks)
+    with pytest.raises(UserError, match=r"127\.0\.0\.1: is no station's; rover obeys station 10\.43\.0\.254"):
+        other.take(ROVER, ANNA)
+
+
+@pytest.mark.parametrize("address", ["10.43.0.1", "10.43.0.2"])
+def test_a_challenge_of_the_robot_is_met(bench: Bench, address: str) -> None:
+    """By the next command; what another computer sends is not looked at."""
+
+    def answer() -> int:
+        return int.from_bytes(bench.datagrams[-1][driving.COMMAND.size :][16:24], "little")
+
+    bench.driving.take(ROVER, ANNA)
+    bench.passes(0.1, ANNA, AHEAD)
+    session, counter = bench.datagrams[-1][driving.COMMAND.size :][:8], (1).to_bytes(8, "little")
+    numbers = session + counter + (4711).to_bytes(8, "little")
+    key = bytes.fromhex(message_keys.between(bench.fleet.stations[0], bench.fleet.robots[1]))
+    tag = hmac.digest(key, b"C" + (5030).to_bytes(2, "little") + numbers, "sha256")[:16]
+    assert answer() == 0
+    bench.driving.hear(numbers + tag, address)
+    bench.passes(0.1, ANNA, AHEAD)
+    assert answer() == (4711 if address == "10.43.0.1" else 0)
