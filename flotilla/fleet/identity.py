@@ -56,6 +56,7 @@ def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
 def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
     """What the templates may use."""
     host_keys = keys.host_keys(fleet)
+    shared_keys = message_keys.read()
     first = _first_dds_port(fleet)
     return _description(fleet, robot) | {
         "hosts": hosts(fleet),
@@ -66,8 +67,8 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "revoked_keys": keys.revoked(),
         "host_public_key": host_keys[robot.name],
         "host_private_key": keys.of_robot(robot).read_text(),
-        "message_key": message_keys.between,
-        "time_key": message_keys.time_key,
+        "message_key": shared_keys.between,
+        "time_key": shared_keys.time,
         "operator_key": keys.public(keys.operator()),
         # Stable, and not to be guessed back to anything (machine-id(5)).
         "machine_id": hashlib.sha256(f"machine-id {host_keys[robot.name]}".encode()).hexdigest()[:32],

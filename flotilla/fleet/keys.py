@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 from flotilla.common import paths
@@ -77,10 +78,10 @@ def revoked() -> list[str]:
     return [" ".join(line.split()[:2]) for line in file.read_text().splitlines()] if file.exists() else []
 
 
-def revocations(robot: str) -> int:
-    """How many host keys of that name nobody accepts."""
+def revocations() -> Counter[str]:
+    """How many host keys nobody accepts, by the robot's name."""
     file = _revoked()
-    return sum(line.split()[2] == robot for line in file.read_text().splitlines()) if file.exists() else 0
+    return Counter(line.split()[2] for line in file.read_text().splitlines()) if file.exists() else Counter()
 
 
 def rotate_host_key(fleet: Fleet, robot: Robot) -> None:

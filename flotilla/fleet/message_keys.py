@@ -12,6 +12,8 @@ import hashlib
 import hmac
 import os
 import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from flotilla.common import paths
@@ -28,21 +30,35 @@ def secret_file() -> Path:
     return paths.KEYS / "fleet_secret"
 
 
-def between(sender: Host, receiver: Host) -> str:
-    """The key of messages from one computer to another, 64 hexadecimal digits."""
-    one, other = (f"{host.name} {keys.revocations(host.name)}" for host in (sender, receiver))
-    return hmac.new(_secret(), f"messages from {one} to {other}".encode(), hashlib.sha256).hexdigest()
+@dataclass(frozen=True)
+class MessageKeys:
+    """A fleet's, as they are now."""
+
+    secret: bytes
+    revocations: Mapping[str, int]
+    """Of robots' host keys, by name; 0 of whom is not named."""
+
+    def between(self, sender: Host, receiver: Host) -> str:
+        """The key of messages from one computer to another, 64 hexadecimal digits."""
+        words = f"messages from {self._identity(sender)} to {self._identity(receiver)}"
+        return hmac.new(self.secret, words.encode(), hashlib.sha256).hexdigest()
+
+    def time(self, one: Host, other: Host) -> str:
+        """The key of NTP messages between two computers, either way: a line of chrony.keys(5), number, type and key."""
+        both = sorted([one, other], key=lambda host: host.name)
+        names = " ".join(host.name for host in both)
+        number = 1 + int.from_bytes(hashlib.sha256(names.encode()).digest()[:4]) % (2**32 - 1)
+        words = f"time between {' and '.join(map(self._identity, both))}"
+        key = hmac.new(self.secret, words.encode(), hashlib.sha256).hexdigest()
+        return f"{number} AES128 HEX:{key[:32].upper()}"
+
+    def _identity(self, host: Host) -> str:
+        return f"{host.name} {self.revocations.get(host.name, 0)}"
 
 
-def time_key(one: Host, other: Host) -> str:
-    """The key of NTP messages between two computers, either way: a line of chrony.keys(5), number, type and key."""
-    both = sorted([one, other], key=lambda host: host.name)
-    number = 1 + int.from_bytes(hashlib.sha256(" ".join(host.name for host in both).encode()).digest()[:4]) % (
-        2**32 - 1
-    )
-    names = " and ".join(f"{host.name} {keys.revocations(host.name)}" for host in both)
-    key = hmac.new(_secret(), f"time between {names}".encode(), hashlib.sha256).hexdigest()
-    return f"{number} AES128 HEX:{key[:32].upper()}"
+def read() -> MessageKeys:
+    """The fleet's; the secret is made if there is none."""
+    return MessageKeys(_secret(), keys.revocations())
 
 
 def write_secret(secret: bytes) -> None:

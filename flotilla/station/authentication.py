@@ -18,7 +18,7 @@ class Signer:
     """Of messages to one port of one robot, from when it is made: a session."""
 
     def __init__(self, key: str, port: int) -> None:
-        """`key`: 64 hexadecimal digits, as `message_keys.between` has them."""
+        """`key`: 64 hexadecimal digits, as `MessageKeys.between` has them."""
         self._key = bytes.fromhex(key)
         self._port = struct.pack("<H", port)
         self._messages = ChaCha20Poly1305(self._digest(b"M"))

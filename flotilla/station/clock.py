@@ -19,7 +19,8 @@ _CONFIGURATION = Path("/etc/chrony/conf.d/flotilla.conf")
 
 def files(fleet: Fleet, station: Host) -> dict[Path, str]:
     """What to put where on the station."""
-    keys = "".join(f"{message_keys.time_key(station, robot)}\n" for robot in fleet.robots.values())
+    shared = message_keys.read()
+    keys = "".join(f"{shared.time(station, robot)}\n" for robot in fleet.robots.values())
     lines = [
         f"# Robots of {fleet.name} ask this computer for the time.",
         f"keyfile {_KEYS}",

@@ -420,7 +420,7 @@ def _signer(fleet: Fleet, address: str, vehicle: Vehicle) -> Signer | None:
             "card was made, by `make backup-keys` and `make restore-keys`, or name the folder: KEYS="
         )
     robot = next(each for each in fleet.robots.values() if each.name == vehicle.robot)
-    return Signer(message_keys.between(_station(fleet, vehicle, address), robot), vehicle.port)
+    return Signer(message_keys.read().between(_station(fleet, vehicle, address), robot), vehicle.port)
 
 
 def _station(fleet: Fleet, vehicle: Vehicle, address: str) -> Host:

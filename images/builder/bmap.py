@@ -52,16 +52,28 @@ def bmap_of(image: Path) -> Path:
     return image.with_suffix(".bmap")
 
 
-def write_bmap(image: Path, extents: Iterable[tuple[int, int]], bmap: Path) -> BlockMap:
-    """Write the map of `image`, of which the `extents` (offset and length in bytes, in any order) matter."""
+def block_map(image: Path, extents: Iterable[tuple[int, int]], known: Iterable[Range] = ()) -> BlockMap:
+    """The map of `image`, of which the `extents` (offset and length in bytes, in any order) matter. `known`: ranges of
+    another image that has the same there, which are not read again."""
+    checksums = {(blocks.first, blocks.last): blocks.sha256 for blocks in known}
     with image.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapping:
         size = len(mapping)
         with memoryview(mapping) as view:
             ranges = tuple(
-                Range(first, last, hashlib.sha256(view[first * BLOCK : (last + 1) * BLOCK]).hexdigest())
+                Range(
+                    first,
+                    last,
+                    checksums.get((first, last))
+                    or hashlib.sha256(view[first * BLOCK : (last + 1) * BLOCK]).hexdigest(),
+                )
                 for first, last in _blocks(extents, size)
             )
-    result = BlockMap(size, ranges)
+    return BlockMap(size, ranges)
+
+
+def write_bmap(image: Path, extents: Iterable[tuple[int, int]], bmap: Path, known: Iterable[Range] = ()) -> BlockMap:
+    """Write the map of `image`; arguments as for `block_map`."""
+    result = block_map(image, extents, known)
     beside = bmap.with_name(bmap.name + ".new")
     beside.write_bytes(_xml(result))
     beside.replace(bmap)

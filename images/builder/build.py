@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import hashlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +16,7 @@ from flotilla.fleet import identity, release_keys
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Board, Fleet, Releases, Robot
 from images.builder import bmap, card, data_partition, manifest, pool, rootfs, runtime, slot, tools
+from images.builder.filesystem import Node
 from images.builder.lock import Lock, board_lock, read_lock
 
 
@@ -64,11 +68,7 @@ def build(
         for robot in robots:
             if robot.board not in boards:
                 boards[robot.board] = board_build(fleet.boards[robot.board], fleet.releases)
-        counted = [(robot, f", {n} of {len(robots)}" if len(robots) > 1 else "") for n, robot in enumerate(robots, 1)]
-        images = [
-            _robot_image(fleet, robot, boards[robot.board], directory, (apps or {}).get(robot.name, ()), count)
-            for robot, count in counted
-        ]
+        images = _robot_images(fleet, robots, boards, directory, apps or {})
         for made in boards.values():
             if missing := made.lock.missing_suites:
                 print(missing_suites(made.lock.name, missing))
@@ -96,44 +96,90 @@ def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
         raise UserError("\n".join(problems))
 
 
+@dataclass(frozen=True)
+class _Common:
+    """What is the same for all cards of a board, found once while the first is made."""
+
+    beginning: Future[hashlib._Hash]
+    """SHA-256 up to the data partition, to be gone on with from a copy."""
+    ranges: Future[bmap.BlockMap]
+    inputs: Future[str]
+    source: Future[manifest.Source | None]
+
+    @classmethod
+    def of(cls, made: BoardBuild, source: Future[manifest.Source | None], threads: ThreadPoolExecutor) -> _Common:
+        image = made.base / "card.img"
+        return cls(
+            threads.submit(manifest.hash_range, image, 0, card.DATA.start),
+            threads.submit(bmap.block_map, image, card.extents(made.base)),
+            threads.submit(manifest.inputs_of_board, made.board, (made.lock, made.tools_lock)),
+            source,
+        )
+
+
+def _robot_images(
+    fleet: Fleet,
+    robots: Sequence[Robot],
+    boards: Mapping[str, BoardBuild],
+    directory: Path,
+    apps: Mapping[str, Sequence[BuiltApp]],
+) -> list[Path]:
+    """Make them, several at once: programs that run and hashing let other threads work."""
+    count = len(robots)
+    directory.mkdir(parents=True, exist_ok=True)
+    title = f"cards of {count} robots" if count > 1 else f"card of {robots[0].name}"
+    with progress.step(title) as step, _threads() as threads:
+        source = threads.submit(manifest.checkout)
+        common = {name: _Common.of(made, source, threads) for name, made in boards.items()}
+        coming = []
+        for robot in robots:
+            own = apps.get(robot.name, ())
+            nodes = data_partition.nodes(fleet, robot, own)  # here, because keys that are missing are made
+            made, same = boards[robot.board], common[robot.board]
+            coming.append(threads.submit(_robot_image, fleet, robot, made, same, directory, own, nodes))
+        said = []
+        for number, one in enumerate(coming):
+            step.at(number, count, "cards")
+            said.append(one.result())
+    print("\n".join(said))
+    return [image_of(robot, directory) for robot in robots]
+
+
+@contextmanager
+def _threads() -> Iterator[ThreadPoolExecutor]:
+    """As many as there are processors. Whatever ends the body, what has not begun does not begin."""
+    threads = ThreadPoolExecutor(os.cpu_count())
+    try:
+        yield threads
+    finally:
+        threads.shutdown(cancel_futures=True)
+
+
 def _robot_image(
-    fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path, apps: Sequence[BuiltApp], count: str
-) -> Path:
-    with progress.step(f"card of {robot.name}{count}"):
-        what = _make_robot_image(fleet, robot, made, directory, apps)
-    print(what)
-    return image_of(robot, directory)
-
-
-def _make_robot_image(fleet: Fleet, robot: Robot, made: BoardBuild, directory: Path, apps: Sequence[BuiltApp]) -> str:
-    """Make it; what it is.
-
-    Hashing takes longest, and lets other threads work: the board's part is hashed while the robot's is made.
-    """
+    fleet: Fleet, robot: Robot, made: BoardBuild, common: _Common, directory: Path, apps: Sequence[BuiltApp],
+    nodes: list[Node],
+) -> str:  # fmt: skip
+    """Make it; what it is."""
     final = image_of(robot, directory)
     work = directory / f".{robot.name}.part"
     cache.discard(work)
-    directory.mkdir(parents=True, exist_ok=True)
     work.mkdir(0o700)  # private keys are in what is made here
     new = work / final.name
     try:
-        with ThreadPoolExecutor() as threads:
-            extents = card.begin(made.base, new)
-            beginning = threads.submit(manifest.hash_range, new, 0, card.DATA.start)
-            source = threads.submit(manifest.checkout)
-            nodes = data_partition.nodes(fleet, robot, apps)
-            data = work / "data.img"
-            extents += card.complete(new, data, card.data_partition(made.tools, data, nodes, made.lock.epoch))
-            data.unlink()
-            mapping = threads.submit(bmap.write_bmap, new, extents, bmap.bmap_of(new))
-            data_part = manifest.part("data partition", new, card.DATA.start, card.DATA.size)
-            whole = manifest.hash_range(new, card.DATA.start, card.DATA.size, beginning.result()).hexdigest()
-            manifest.write(
-                fleet, robot, (made.lock, made.tools_lock), made.manifest, nodes=nodes, source=source.result(),
-                data=data_part, image=manifest.Part(name=final.name, bytes=card.SIZE, sha256=whole), extents=extents,
-                apps=apps, beside=new,
-            )  # fmt: skip
-            mapped = mapping.result().mapped
+        extents = card.begin(made.base, new)
+        data = work / "data.img"
+        extents += card.complete(new, data, card.data_partition(made.tools, data, nodes, made.lock.epoch))
+        data.unlink()
+        mapped = bmap.write_bmap(new, extents, bmap.bmap_of(new), common.ranges.result().ranges).mapped
+        data_part = manifest.part("data partition", new, card.DATA.start, card.DATA.size)
+        beginning = common.beginning.result().copy()
+        whole = manifest.hash_range(new, card.DATA.start, card.DATA.size, beginning).hexdigest()
+        manifest.write(
+            fleet, robot, (made.lock, made.tools_lock), made.manifest, board_inputs=common.inputs.result(),
+            nodes=nodes, source=common.source.result(), data=data_part,
+            image=manifest.Part(name=final.name, bytes=card.SIZE, sha256=whole), extents=extents,
+            apps=apps, beside=new,
+        )  # fmt: skip
         new.with_suffix(".sha256").write_text(f"{whole}  {final.name}\n")
         for made_file in sorted(work.iterdir()):
             made_file.rename(directory / made_file.name)

@@ -386,6 +386,7 @@ def write(
     locks: tuple[Lock, Lock],
     common: Path,
     *,
+    board_inputs: str,
     nodes: list[Node],
     apps: Sequence[BuiltApp],
     source: Source | None,
@@ -396,7 +397,8 @@ def write(
 ) -> None:
     """Write the manifest and the bills of materials of `beside`, an image of which everything is known.
 
-    `locks`: the board's and the build tools'. `common`: what `shared` made.
+    `locks`: the board's and the build tools'. `common`: what `shared` made. `board_inputs`: what `inputs_of_board`
+    said.
     """
     board = fleet.boards[robot.board]
     lock, tools_lock = locks
@@ -409,7 +411,7 @@ def write(
         lock=_lock_id(lock),
         tools=_lock_id(tools_lock),
         epoch=lock.epoch,
-        inputs=inputs(board, locks, nodes),
+        inputs=inputs(board_inputs, nodes),
         source=source,
         image=image,
         parts=[*same.parts, data],
@@ -456,9 +458,22 @@ def with_apps(bill: str, robot: str, apps: Sequence[App]) -> str:
     return json.dumps(_sorted(document), indent=1, ensure_ascii=False, sort_keys=True) + "\n"
 
 
-def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
-    """One hash over all that goes into a robot's image: rather too much (all of the builder) than too little."""
+def inputs_of_board(board: Board, locks: tuple[Lock, Lock]) -> str:
+    """One hash over all that goes into the images of a board's robots, but for what is a robot's own: rather too much
+    (all of the builder) than too little."""
     images = paths.PROJECT / "images"
+    own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
+    return cache.digest(
+        *(lock.digest for lock in locks), *own_kernel, runtime.key(board.architecture), paths.OVERLAY,
+        images / "release.yml", images / "rootfs", images / "boot", images / "builder",
+        paths.PROJECT / "flotilla" / "fleet", paths.PROJECT / "flotilla" / "common",
+        paths.PROJECT / "requirements.lock",
+        board.model_dump_json(),
+    )  # fmt: skip
+
+
+def inputs(of_board: str, nodes: list[Node]) -> str:
+    """One hash over all that goes into a robot's image."""
     identity = [
         part
         for node in nodes
@@ -468,14 +483,7 @@ def inputs(board: Board, locks: tuple[Lock, Lock], nodes: list[Node]) -> str:
             str(node.content is None),
         )
     ]
-    own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
-    return cache.digest(
-        *(lock.digest for lock in locks), *own_kernel, runtime.key(board.architecture), paths.OVERLAY,
-        images / "release.yml", images / "rootfs", images / "boot", images / "builder",
-        paths.PROJECT / "flotilla" / "fleet", paths.PROJECT / "flotilla" / "common",
-        paths.PROJECT / "requirements.lock",
-        board.model_dump_json(), *identity,
-    )  # fmt: skip
+    return cache.digest(of_board, *identity)
 
 
 def partitions(extents: card.Extents) -> list[Partition]:

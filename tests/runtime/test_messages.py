@@ -119,7 +119,7 @@ def test_a_message_is_added_by_data_alone(transport: str, fleet: Fleet, flotilla
     fleet = by(transport, fleet)
     texts = {name: task.decode() for name, task in identity.control_tasks(fleet, fleet.robots[1]).items()}
     robot = fleet.robots[1]
-    key = message_keys.between(robot, robot)
+    key = message_keys.read().between(robot, robot)
     (tmp_path / message_keys.CREDENTIAL).write_text(f"{robot.address} {key} {key}\n")
     (stream,) = telemetry.streams(fleet)
     assert (stream.topic, stream.length, stream.every) == ("/robot1/sink/heard", HEARD.size, 2)

@@ -69,6 +69,16 @@ def test_the_same_image_gives_the_same_map(image: Path) -> None:
     assert bmap_of(image).read_bytes() == first
 
 
+def test_what_is_known_of_another_image_is_not_read_again(image: Path) -> None:
+    """One that goes on further is read. Seen to fail where `known` goes by the first block alone."""
+    known = [Range(0, 0, "a" * 64), Range(3, 3, "b" * 64), Range(9, 9, "c" * 64)]
+    made = write_bmap(image, [(0, 1), (3 * BLOCK, 2 * BLOCK)], bmap_of(image), known)
+    assert made.ranges == (
+        Range(0, 0, "a" * 64),
+        Range(3, 4, hashlib.sha256(CONTENT[3 * BLOCK : 5 * BLOCK]).hexdigest()),
+    )
+
+
 def test_an_image_that_ends_inside_a_block(image: Path) -> None:
     image.write_bytes(CONTENT[: BLOCK + 100])
     bmap = write_bmap(image, [(BLOCK, 100)], bmap_of(image))

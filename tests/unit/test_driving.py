@@ -292,7 +292,7 @@ def test_a_challenge_of_the_robot_is_met(bench: Bench, address: str) -> None:
     bench.passes(0.1, ANNA, AHEAD)
     session, counter = bench.datagrams[-1][driving.COMMAND.size :][:8], (1).to_bytes(8, "little")
     numbers = session + counter + (4711).to_bytes(8, "little")
-    key = bytes.fromhex(message_keys.between(bench.fleet.stations[0], bench.fleet.robots[1]))
+    key = bytes.fromhex(message_keys.read().between(bench.fleet.stations[0], bench.fleet.robots[1]))
     tag = hmac.digest(key, b"C" + (5030).to_bytes(2, "little") + numbers, "sha256")[:16]
     assert answer() == 0
     bench.driving.hear(numbers + tag, address)

@@ -163,7 +163,7 @@ def test_every_build_says_in_one_line_what_its_lock_lacks(
     monkeypatch.setattr("images.builder.build.cache.exclusive", nullcontext)
     monkeypatch.setattr(build, "check_tasks", lambda *_: None)
     monkeypatch.setattr(build, "board_build", lambda board, _: SimpleNamespace(lock=locks[board.name]))
-    monkeypatch.setattr(build, "_robot_image", lambda *_: Path("robot.img"))
+    monkeypatch.setattr(build, "_robot_images", lambda *_: [])
     build.build(fleet, [fleet.robots[number] for number in (1, 2, 3)])
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("smartcoret3: its packages are locked without bookworm-updates, bookworm-security, whose")
@@ -204,19 +204,23 @@ def test_hash_of_a_file_with_holes(tmp_path: Path) -> None:
 
 def test_inputs_follow_everything(fleet: Fleet) -> None:
     board, locks = fleet.boards["smartcoret3"], (LOCK, LOCK)
-    same = manifest.inputs(board, locks, NODES)
-    assert same == manifest.inputs(board, locks, list(NODES))
+    of_board = manifest.inputs_of_board(board, locks)
+    same = manifest.inputs(of_board, NODES)
+    assert same == manifest.inputs(manifest.inputs_of_board(board, locks), list(NODES))
     hostname = NODES[1]
-    others = [
-        manifest.inputs(fleet.boards["x86_64"], locks, NODES),
-        manifest.inputs(board, (LOCK, replace(LOCK, packages=LOCK.packages[1:])), NODES),
-        manifest.inputs(board, locks, NODES[:1]),
-        manifest.inputs(board, locks, [NODES[0], replace(hostname, content=b"robot4\n")]),
-        manifest.inputs(board, locks, [NODES[0], replace(hostname, content=b"")]),
-        manifest.inputs(board, locks, [NODES[0], replace(hostname, content=None)]),
-        manifest.inputs(board, locks, [NODES[0], replace(hostname, mode=0o600)]),
-        manifest.inputs(board, locks, [NODES[0], replace(hostname, uid=1000)]),
+    of_others = [
+        manifest.inputs_of_board(fleet.boards["x86_64"], locks),
+        manifest.inputs_of_board(board, (LOCK, replace(LOCK, packages=LOCK.packages[1:]))),
     ]
+    own = [
+        replace(hostname, content=b"robot4\n"),
+        replace(hostname, content=b""),
+        replace(hostname, content=None),
+        replace(hostname, mode=0o600),
+        replace(hostname, uid=1000),
+    ]
+    others = [manifest.inputs(other, NODES) for other in of_others]
+    others += [manifest.inputs(of_board, [NODES[0], *changed]) for changed in ([], *([node] for node in own))]
     assert len({same, *others}) == 1 + len(others)
 
 
@@ -278,7 +282,7 @@ def written(
     image = directory / f"robot{number}.img"
     locks = lock or read_lock("smartcoret3"), read_lock("tools")
     manifest.write(
-        fleet, fleet.robots[number], locks, common, nodes=NODES, source=source, apps=(),
+        fleet, fleet.robots[number], locks, common, board_inputs="0", nodes=NODES, source=source, apps=(),
         data=manifest.Part(name="data partition", bytes=9, sha256="1"),
         image=manifest.Part(name=image.name, bytes=card.SIZE, sha256="2"), extents=EXTENTS, beside=image,
     )  # fmt: skip

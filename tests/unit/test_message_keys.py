@@ -114,4 +114,4 @@ def test_a_broken_secret_is_named(fleet: Fleet, text: str) -> None:
     message_keys.write_secret(bytes(32))
     message_keys.secret_file().write_text(text)
     with pytest.raises(UserError, match="fleet_secret: is not 64 hexadecimal digits; restore it"):
-        message_keys.between(fleet.robots[3], Host(name="station", address=fleet.stations[0].address))
+        message_keys.read().between(fleet.robots[3], Host(name="station", address=fleet.stations[0].address))

@@ -47,7 +47,7 @@ def test_firewall_admits_the_fleet_alone(robot: RobotGuest, fleet: Fleet) -> Non
 def test_nobody_without_the_key_tells_the_time(robot: RobotGuest, fleet: Fleet) -> None:
     """By a neighbour with another robot's address. Seen to fail for a configuration whose servers have no key."""
     other = next(each for each in fleet.robots.values() if each != robot.robot)
-    key = message_keys.time_key(robot.robot, other)
+    key = message_keys.read().time(robot.robot, other)
     found = call(robot, time_server, str(other.address), str(robot.robot.address), f"{key}\n", timeout=300)
     for kind in ("none", "wrong"):
         answers, taken = found[kind]
