@@ -42,8 +42,7 @@ SECONDS = 900
 BOARD = "smartcoret3"
 ONE = "robot2"
 """Whose place in the cell is disturbed."""
-DISTURBED = pytest.mark.nightly
-"""What takes a minute or two beside the rest."""
+pytestmark = pytest.mark.nightly  # each time, test_scenarios.py flies over the air, shared/test_radio.py joins a cell
 CUT_SHARE, WELL_SHARE = 0.02, 0.1
 """Of steps that come all the way round: without a link the last one is repeated, and a busy computer loses some."""
 RMS_M = 0.019
@@ -135,7 +134,6 @@ def test_addresses_are_on_the_radio(lab: GuestFleet) -> None:
         assert sh(lab, name, "cat /run/flotilla/cell") == "in the cell"
 
 
-@pytest.mark.nightly  # minutes of the guests' processors; test_fleet.py has the same play by wire
 def test_provisioning_over_the_air_changes_nothing(lab: GuestFleet, described: Path, tmp_path: Path) -> None:
     ports = {name: lab.segment.ssh_port(robot.address) for name, robot in robots(lab).items()}
     there = Guests(robots(lab), dict(lab.machines), dict(lab.shells), ports, tmp_path)
@@ -156,7 +154,6 @@ def later(lab: GuestFleet, name: str, script: str) -> None:
     )
 
 
-@DISTURBED
 @pytest.mark.parametrize(
     ("drift", "because"),
     [
@@ -176,7 +173,6 @@ def test_what_drifts_is_named_and_mended(lab: GuestFleet, drift: str, because: s
     is_well(lab)
 
 
-@DISTURBED
 def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the test before left, as the station asks for it."""
     shell, robot = lab.shells[ONE], robots(lab)[ONE]
@@ -187,7 +183,6 @@ def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> 
     assert answer.tasks["navigation"].good
 
 
-@DISTURBED
 def test_an_adapter_may_be_pulled_and_come_back(lab: GuestFleet, segment: RadioSegment) -> None:
     boot = sh(lab, ONE, "cat /proc/sys/kernel/random/boot_id")
     segment.air.plug(ONE, plugged=False)
@@ -198,7 +193,6 @@ def test_an_adapter_may_be_pulled_and_come_back(lab: GuestFleet, segment: RadioS
     is_well(lab)
 
 
-@DISTURBED
 def test_missing_firmware_is_named_on_the_console(lab: GuestFleet, segment: RadioSegment) -> None:
     """And the robot joins as soon as it is there."""
     sh(lab, ONE, "mkdir -p /run/nothing; mount --bind /run/nothing /usr/lib/firmware")
@@ -212,7 +206,6 @@ def test_missing_firmware_is_named_on_the_console(lab: GuestFleet, segment: Radi
     is_well(lab)
 
 
-@DISTURBED
 def test_a_computer_out_of_range_is_missed_until_it_is_back(lab: GuestFleet, segment: RadioSegment) -> None:
     assert lab.robot.board.wait_relays(on=False, timeout=SECONDS)
     segment.air.reach(ONE, reached=False)
@@ -222,7 +215,6 @@ def test_a_computer_out_of_range_is_missed_until_it_is_back(lab: GuestFleet, seg
     assert sh(lab, ONE, "cat /run/flotilla/cell") == "in the cell", "it had been in the cell, with nobody in its range"
 
 
-@DISTURBED
 def test_who_joins_late_is_let_in(lab: GuestFleet) -> None:
     lab.machines[ONE].cut()
     is_cut(lab)
@@ -230,7 +222,6 @@ def test_who_joins_late_is_let_in(lab: GuestFleet) -> None:
     is_well(lab)
 
 
-@DISTURBED
 @pytest.mark.parametrize("loss", [0, 0.01, 0.05, 0.1])
 def test_the_square_is_flown_with_loss(
     lab: GuestFleet, segment: RadioSegment, loss: float, record_property: Callable[[str, object], None]
@@ -271,7 +262,6 @@ def twelve(tmp_path: Path) -> Path:
     return directory
 
 
-@pytest.mark.nightly
 def test_twelve_robots_on_another_subnet_and_channel(twelve: Path, tmp_path: Path) -> None:
     """Each reaches each other and the station. What `check-fleet` asks first, is asked first."""
     fleet = inventory.load_fleet(twelve)

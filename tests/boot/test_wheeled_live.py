@@ -23,6 +23,9 @@ from lab.qemu.timing import Deadline
 from lab.wheeled import live
 from lab.wheeled.live import Live
 
+# Each time, test_station_page.py drives the same robot, and test_wheeled_virtual.py in exact time.
+pytestmark = pytest.mark.nightly
+
 PATIENCE_S = 300
 """Until something comes of a command; only finite."""
 ME = driving.Operator("test", "test")

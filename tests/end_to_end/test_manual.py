@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -151,6 +152,8 @@ ELSEWHERE = {
     "make latency-accept": "changes what tests compare with",
 }
 """Commands that need hardware, a terminal or time, with who does the like."""
+DEAR = ("make fleet N=2", "make provision ON=guests", "make fleet-status", "make fleet-down", "make scenarios")
+"""Run nightly: guests that test_fleet.py has each time, and a flight as test_scenarios.py flies it each time."""
 BEGINNINGS = ("make ", "build/runtime/flotilla-", "mkdir -p build/")
 """Of commands that are ours to run."""
 SHOWN = {
@@ -213,9 +216,11 @@ def run(command: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def left_to_run() -> list[str]:
-    """Of the pages, without what the tutorial runs."""
-    return [command for command in commands(*PAGES) if command not in {*ELSEWHERE, *commands(TUTORIAL)}]
+def left_to_run() -> list[Any]:
+    """Of the pages, without what the tutorial's test runs."""
+    others = [command for command in commands(*PAGES) if command not in {*ELSEWHERE, *commands(TUTORIAL)}]
+    others += [command for command in commands(TUTORIAL) if command in DEAR]
+    return [pytest.param(each, marks=[pytest.mark.nightly] if each in DEAR else []) for each in others]
 
 
 @pytest.mark.parametrize("command", left_to_run())
@@ -227,6 +232,7 @@ def test_command(command: str, flotilla_run: Path) -> None:
 def test_no_reason_outlives_its_command() -> None:
     assert set(ELSEWHERE) <= set(commands(*PAGES))
     assert {*SHOWN, BOOT} <= set(commands(TUTORIAL))
+    assert set(DEAR) <= set(commands(*PAGES, TUTORIAL))
     assert not set(ELSEWHERE) & set(commands(TUTORIAL)), "the tutorial is run as it stands"
 
 
@@ -276,7 +282,7 @@ def booted(fleet: Fleet, log: Path) -> Iterator[None]:
 
 
 def test_a_stranger_follows_the_tutorial_to_a_block_of_their_own(fleet: Fleet, tmp_path: Path) -> None:
-    """From an installed computer to a guest that runs the block of the page, as the page says, and a flight."""
+    """From an installed computer to a guest that runs the block of the page, as the page says."""
     app = paths.PROJECT / "apps" / "hover"
     assert not app.exists(), "the tutorial's app is there already; move it away"
     blocks = code(TUTORIAL)
@@ -297,6 +303,8 @@ def follow(blocks: list[Code]) -> None:
             assert block.file.exists(), f"{block.file}: the page makes it before it is changed"
             block.file.write_text(block.text)
         for command in block.commands:
+            if command in DEAR:
+                continue
             assert command.startswith(BEGINNINGS)
             assert SHOWN.get(command, "") in run(command).stdout, command
 

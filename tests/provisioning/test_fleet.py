@@ -157,6 +157,7 @@ def test_robots_that_were_just_flashed_are_up_to_date(guests: Guests) -> None:
     assert all(name in page for name in guests.robots)
 
 
+@pytest.mark.nightly  # each time, unit/test_health.py judges reports
 def test_a_robots_own_report_stops_the_roll_out(guests: Guests) -> None:
     """The gyro's port is silent, and then the task is stopped now and then, so that it overruns. The same robots are
     healthy in the test before, where nobody asks for gyro or time."""
@@ -221,7 +222,7 @@ def test_tasks_take_other_keys(guests: Guests) -> None:
     assert "10.43" not in guests.sudo("robot1", credentials)
 
 
-@pytest.mark.nightly  # each time, the report of an unwell robot stops a roll-out
+@pytest.mark.nightly
 def test_a_robot_that_dies_stops_the_roll_out_and_nothing_is_half_done(guests: Guests) -> None:
     for name in guests.robots:
         guests.sudo(name, "echo 10.42.0.99 stranger >>/etc/hosts; sysctl -q kernel.panic=0")
@@ -275,6 +276,7 @@ def test_the_wrong_robot_is_refused_with_the_reason(guests: Guests, tmp_path: Pa
     assert "Connection refused" in done.report["robots"]["robot1"]["messages"][0]
 
 
+@pytest.mark.nightly
 def test_a_card_in_another_computer_is_noticed(guests: Guests, tmp_path: Path) -> None:
     robots = (paths.INVENTORY / "robots.yml").read_text()
     lines = "        robot2:\n          number: 2\n          address: 10.42.0.2\n"
@@ -304,6 +306,7 @@ def test_the_inventory_is_checked_before_anything_is_done(guests: Guests, tmp_pa
     assert "is robot3's number" in done.report["robots"]["robot2"]["messages"][0]
 
 
+@pytest.mark.nightly
 def test_a_task_is_stopped_and_started(guests: Guests) -> None:
     def state(done: Playbook) -> str:
         assert done.status == 0, done.said
@@ -317,6 +320,7 @@ def test_a_task_is_stopped_and_started(guests: Guests) -> None:
     assert "do=halt: one of status, deploy" in refused.said
 
 
+@pytest.mark.nightly
 def test_what_robots_say_and_record_is_collected(guests: Guests) -> None:
     guests.sudo("robot1", "echo 1,2,3 >/var/lib/flotilla/heading/some.csv; chown -R robot /var/lib/flotilla/heading")
     done = guests.play("-l", "robot1", playbook="collect")

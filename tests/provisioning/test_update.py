@@ -148,6 +148,7 @@ def test_the_updater_fits_into_its_memory(
     assert max(peak for _, peak in peaks.values()) < MEMORY_KIB, "it would have taken more"
 
 
+@pytest.mark.nightly  # ten minutes; each time, test_update_virtual.py brings one, and test_boot_loader.py tries it
 def test_a_release_is_brought_tried_and_kept(guests: Guests, make: Make) -> None:
     """With the word of the station."""
     done = update(guests, make(2), *STOP, *ONE)

@@ -27,7 +27,12 @@ _STANDING = {robot.board: robot.number for robot in reversed(_FLEET.robots.value
 _STANDING[_FLEET.robots[PENTIUM].board] = PENTIUM
 """The robots that stand for their boards: the first one each, but for that one."""
 SYSTEMS = [
-    pytest.param((number, "debian"), id=f"{board}-debian") for board, number in sorted(_STANDING.items())
+    pytest.param(
+        (number, "debian"), id=f"{board}-debian",
+        # test_fleet.py boots the others' each time.
+        marks=[] if board == _FLEET.board().name else [pytest.mark.nightly],
+    )
+    for board, number in sorted(_STANDING.items())
 ] + [  # after those whose kernel has not to be built
     pytest.param(
         (number, "lean"), id=f"{board}-lean",
