@@ -119,8 +119,14 @@ def _streams(name: str, message: Message, messages: Messages) -> Iterator[Findin
             yield ("standby",), "stations tell robots apart, and get what each sends", "remove it"
         if message.charge and (not charge or charge.width > 1 or charge.type not in ("single", "double")):
             yield ("charge",), "is not a signal of one single or double", "one of signals, or remove it"
+        for index, counted in enumerate(message.attempts):
+            count = message.signals.get(counted)
+            if not count or count.width > 1 or "int" not in count.type:
+                yield ("attempts", index), "is not a signal of one integer", "one of signals, or remove it"
     elif message.foxglove:
         yield ("foxglove",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
+    elif message.attempts:
+        yield ("attempts",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
     elif message.charge:
         yield ("charge",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
 

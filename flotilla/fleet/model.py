@@ -505,6 +505,9 @@ class Message(_Model):
     """`true`: another robot may be a hot standby for the sender."""
     charge: SignalName | None = None
     """Signal that is a battery's state of charge, 0 to 1. `make top` shows it."""
+    attempts: list[SignalName] = []
+    """Signals that count what the sender refused: datagrams that nobody should have sent. `make top` and the station's
+    page name those that are not 0."""
     foxglove: dict[SignalName, Drawn] = {}
     """What viewers draw of it, by name: `pose` of `control-report` becomes the topic `/robot3/control/report/pose`."""
     signals: dict[SignalName, Signal]

@@ -29,6 +29,8 @@ class Stream:
     """Steps of the task from one datagram to the next."""
     charge: str | None = None
     """The field that is a battery's state of charge, 0 to 1."""
+    attempts: tuple[str, ...] = ()
+    """Fields that count what the robot refused since the task began."""
     units: Mapping[str, Sequence[str]] = field(default_factory=dict, compare=False)
     """Of each signal's elements, or one for all, where messages.yml says them."""
     drawings: Mapping[str, Drawing] = field(default_factory=dict, compare=False)
@@ -67,6 +69,7 @@ def streams(fleet: Fleet) -> list[Stream]:
             step_s=message.step_s,
             every=message.every,
             charge=message.charge,
+            attempts=tuple(message.attempts),
             units={name.replace("-", "_"): signal.unit for name, signal in message.signals.items() if signal.unit},
             drawings={name: Drawing(drawn, message.signals) for name, drawn in message.foxglove.items()},
         )

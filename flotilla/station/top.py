@@ -68,8 +68,15 @@ class Row:
     """Of the last datagram; None: there was none."""
     charge: float | None
     """The battery's last, 0 to 1; None where the stream has none."""
+    attempts: dict[str, int]
+    """What the robot refused since its task began, by kind; those that are not 0."""
     flags: dict[str, float]
     """By the names of boolean signals: in which part of the datagrams each was true, 0 to 1."""
+
+    @property
+    def refusals(self) -> str:
+        """`410 forged, 206 replayed`; empty: it refused nothing."""
+        return ", ".join(f"{count} {kind}" for kind, count in self.attempts.items())
 
     def silent(self, stream: Stream) -> bool:
         """Whether nothing came of its stream for as long as ten datagrams take."""
@@ -98,12 +105,16 @@ class StreamStats:
         self._step = self._lost = 0
         self._charge_of = stream.charge
         self._charge: float | None = None
+        self._counted = stream.attempts
+        self._attempts: dict[str, int] = {}
 
     def take(self, values: Mapping[str, Value], received_ns: int) -> None:
         if self._steps and isinstance(step := values["step"], int):
             self._count_lost(step)
         if self._charge_of and isinstance(charge := values[self._charge_of], float):
             self._charge = charge
+        counts = {kind: values[kind] for kind in self._counted}
+        self._attempts = {kind: count for kind, count in counts.items() if isinstance(count, int) and count}
         self._recent.append(_Came(received_ns, self._lost, tuple(bool(values[name]) for name in self._flags)))
         while self._recent[0].received_ns <= received_ns - WINDOW_NS:
             self._recent.popleft()
@@ -129,6 +140,7 @@ class StreamStats:
             link=len(recent) / (len(recent) + lost) if self._steps else None,
             age_s=(now_ns - self._recent[-1].received_ns) / 1e9 if self._recent else None,
             charge=self._charge,
+            attempts=self._attempts,
             flags={name: sum(each[i] for each in shown) / len(shown) for i, name in enumerate(self._flags) if shown},
         )
 
@@ -234,7 +246,11 @@ class Top:
             table.add_row(robot, task, period, *[""] * (len(_TITLES) - 3), *_asked(state))
         if chosen is not None:
             table.rows[chosen].style = "reverse"
-        notes = [f"{robot}: radio {said}" for robot, said in sorted(self._cells.items()) if said]
+        rows = {stream: self._stats[stream.topic].row(now_ns) for stream in self._known}
+        notes = [
+            f"{each.robot}: {each.task} refused messages: {row.refusals}" for each, row in rows.items() if row.refusals
+        ]
+        notes += [f"{robot}: radio {said}" for robot, said in sorted(self._cells.items()) if said]
         if self._receiver.strangers:
             notes.append(f"{self._receiver.strangers} datagrams of strangers left out")
         if notes:

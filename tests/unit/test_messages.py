@@ -109,6 +109,13 @@ CASES = {
     "charge that is not there": Case(
         "rate_hz: 10\n", "rate_hz: 10\n  charge: soc\n", "control-report.charge", "not a signal of", "soc", "soc",
     ),
+    "attempts of a message between tasks": Case(
+        "  standby: true", "  attempts: [step]", "wrench.attempts", "no use for…stations", "[",
+    ),
+    "attempts that are none": Case(
+        "rate_hz: 10\n", "rate_hz: 10\n  attempts: [step, wanted]\n", "control-report.attempts.1", "one integer",
+        "wanted",
+    ),
     "drawing of a message between tasks": Case(
         "  standby: true", "  foxglove: { pose: { type: PoseInFrame } }", "wrench.foxglove", "no use for", "foxglove",
     ),

@@ -44,7 +44,7 @@ def heard(steps: Iterable[int], bad: Iterable[int] = ()) -> Row:
 
 def row(rate_hz: float, flags: dict[str, float], link: float = 1, age_s: float | None = 0) -> Row:
     """Where nothing was lost, and there is no battery."""
-    return Row(rate_hz=rate_hz, lost=0, link=link, age_s=age_s, charge=None, flags=flags)
+    return Row(rate_hz=rate_hz, lost=0, link=link, age_s=age_s, charge=None, attempts={}, flags=flags)
 
 
 def test_all_came() -> None:
@@ -129,6 +129,21 @@ def reporting(rate_hz: float, every: int, charge: str | None = None, **signals: 
         sender="heading", receiver="stations", port=5030, rate_hz=rate_hz, every=every, charge=charge, signals=signals
     )
     return fleet.model_copy(update={"messages": {"heading-power": message}})
+
+
+def test_what_a_robot_refused_is_named() -> None:
+    """By kind, as the message says. Seen to fail where a count of 0 is named, too."""
+    count = Signal(type="uint32")
+    message = reporting(100, 1, forged=count, replayed=count, other=count).messages["heading-power"]
+    fleet = reporting(100, 1).model_copy(
+        update={"messages": {"heading-power": message.model_copy(update={"attempts": ["forged", "replayed"]})}}
+    )
+    (stream,) = streams(fleet)
+    top = Top(Receiver([stream]), clock=lambda: 0)
+    top.take(stream, {"forged": 0, "replayed": 0, "other": 3}, 0)
+    assert "refused messages" not in top.end()
+    top.take(stream, {"forged": 410, "replayed": 0, "other": 3}, 0)
+    assert top.end().splitlines()[-1].strip() == "robot1: heading refused messages: 410 forged"
 
 
 def test_the_rate_is_the_message_s() -> None:

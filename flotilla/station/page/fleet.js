@@ -104,6 +104,7 @@ export class Fleet {
     for (const stream of own) {
       const row = state.streams[stream.topic];
       if (row.charge !== null) parts.push(["battery", `${Math.round(100 * row.charge)} %`, row.charge < LOW_CHARGE]);
+      if (row.refusals) parts.push([stream.task, `refused ${row.refusals}`, true]);
       for (const flag of row.bad) parts.push([stream.task, `not ${flag}`, true]);
     }
     const pose = state.poses[robot.name];
