@@ -61,6 +61,7 @@ def test_power_cut_while_writing(fresh_guest: GuestFactory, fleet: Fleet, toolse
     toolset.run("usr/sbin/e2fsck", "-f", "-n", data)
 
 
+@pytest.mark.nightly  # each time, test_boot_loader.py damages slots, test_bad_releases.py tries a bad one
 def test_damaged_slot_falls_back_and_a_hang_ends(fresh_guest: GuestFactory, tmp_path: Path) -> None:
     """Slot A is damaged and has one try left, slot B is good; then the running system hangs. One card for both."""
     robot = fresh_guest(PENTIUM, boot=False)

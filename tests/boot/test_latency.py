@@ -58,7 +58,10 @@ def test_a_run_repeats_to_the_byte_however_the_host_schedules(
     ("control", "scenario", "late_us", "named"),
     [
         (Control(delay="irq"), "idle", DELAY_US, ["the timer found irq_test in", "preemptirqtest"]),
-        (Control(delay="preempt"), "idle", DELAY_US, ["the timer found preempt_test in", "preemptirqtest"]),
+        pytest.param(
+            Control(delay="preempt"), "idle", DELAY_US, ["the timer found preempt_test in", "preemptirqtest"],
+            marks=pytest.mark.nightly,
+        ),
         pytest.param(
             NO_RT, "timerlat-everything", DELAY_US, ["the kernel is without PREEMPT_RT", "the timer found "],
             marks=pytest.mark.nightly,  # a kernel of its own

@@ -235,6 +235,7 @@ def test_an_app_that_leaks_is_killed_and_nothing_else(bench: Bench) -> None:
     bench.do("leaking", "remove")
 
 
+@pytest.mark.nightly  # it starts the robot anew, which takes minutes
 def test_a_kept_app_starts_with_the_robot(bench: Bench) -> None:
     """Power fails as soon as the command is done. An app that is not kept shows that the restart was one."""
     with bench.connection() as to:
@@ -346,6 +347,7 @@ def test_what_does_not_compile_or_check_is_not_deployed(bench: Bench) -> None:
     bench.do("broken", "remove")
 
 
+@pytest.mark.nightly
 def test_a_full_data_partition_refuses_and_leaves_the_last_good_app(bench: Bench) -> None:
     directory = bench.new("block", "room")
     bench.place(directory)

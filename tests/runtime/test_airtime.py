@@ -223,6 +223,7 @@ def test_a_robot_that_hears_no_multicast_gets_a_copy_by_ssh(cell: Cell) -> None:
     assert not any((place / "known/spool").exists() for place in cell.robots.values())
 
 
+@pytest.mark.nightly  # each time, test_multicast.py kills sender and receivers
 def test_what_is_cut_off_goes_on(cell: Cell) -> None:
     """A receiver is killed, then the station, then a robot leaves."""
     bundle = cell.release(7)

@@ -12,7 +12,7 @@ from flotilla.common import paths
 from tests.conftest import GuestFactory
 
 
-@pytest.mark.parametrize("number", [3, 2])
+@pytest.mark.parametrize("number", [3, pytest.param(2, marks=pytest.mark.nightly)])
 def test_every_block_is_on_the_robot(guest: GuestFactory, flotilla_run: Path, number: int) -> None:
     """Those of plug-ins too, which only load where their libraries are there."""
     here = subprocess.run(
@@ -24,6 +24,7 @@ def test_every_block_is_on_the_robot(guest: GuestFactory, flotilla_run: Path, nu
     assert names >= {"dds-publish", "frame-grabber-iidc", "gain"}
 
 
+@pytest.mark.nightly  # each time, tests/runtime runs tasks on this computer
 def test_task_on_the_other_architecture(guest: GuestFactory) -> None:
     pc = guest(2)
     pc.shell.run(["tee", "/tmp/task.yml"], stdin=(paths.TASKS / "heartbeat.yml").read_text())
