@@ -13,7 +13,6 @@ from __future__ import annotations
 import copy
 import functools
 import math
-import select
 import shutil
 import socket
 import struct
@@ -124,48 +123,53 @@ class LiveRobot:
 
 
 class Commands:
-    """Carries commands to the address that a robot has here, whoever they are from on this computer, and the robot's
-    answers back: QEMU takes nobody but 127.0.0.1 for the station."""
+    """Carries commands that come to the address a robot has here, whoever they are from on this computer: QEMU takes
+    nobody but 127.0.0.1 for the station. It brings no answers of the robot, so these come by `answer`."""
 
     def __init__(self, address: str, port: int) -> None:
         """`port`: of 127.0.0.1, which leads to the robot."""
         self._there = ("127.0.0.1", port)
         self._here = _datagrams(address, COMMAND_PORT)
         self._senders: dict[tuple[str, int], socket.socket] = {}
-        """A socket towards the robot for each, by where they send from."""
-        self._end, self._ended = socket.socketpair()
+        """A socket towards the robot for each, by where they send from: the robot sees that socket's port."""
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        self._end.close()
+        self._ended.set()
+        with suppress(OSError):  # it says so, though it wakes who receives: it is not connected
+            self._here.shutdown(socket.SHUT_RDWR)
         self._thread.join()
-        for each in (self._here, self._ended, *self._senders.values()):
+        for each in (self._here, *self._senders.values()):
             each.close()
+
+    def answer(self, port: int, datagram: bytes) -> bool:
+        """What the robot sent to this port of the station: False if no command came from there."""
+        with self._lock:
+            for sender, towards in self._senders.items():
+                if towards.getsockname()[1] == port:
+                    self._here.sendto(datagram, sender)
+                    return True
+        return False
 
     def _carry(self) -> None:
         while True:
-            ready, _, _ = select.select([self._ended, self._here, *self._senders.values()], [], [])
-            if self._ended in ready:
+            datagram, sender = self._here.recvfrom(_LONGEST)
+            if self._ended.is_set():
                 return
-            for one in ready:
-                with suppress(ConnectionRefusedError):  # of one before, while the segment ends
-                    self._pass_on(one)
-
-    def _pass_on(self, one: socket.socket) -> None:
-        if one is self._here:
-            datagram, sender = one.recvfrom(_LONGEST)
-            self._towards(sender).sendto(datagram, self._there)
-        elif found := [each for each, towards in self._senders.items() if towards is one]:
-            self._here.sendto(one.recv(_LONGEST), found[0])
+            with suppress(ConnectionRefusedError):  # of one before, while the segment ends
+                self._towards(sender).sendto(datagram, self._there)
 
     def _towards(self, sender: tuple[str, int]) -> socket.socket:
         """Of many senders the one that came first is forgotten."""
-        if sender not in self._senders:
-            if len(self._senders) == _SENDERS:
-                self._senders.pop(next(iter(self._senders))).close()
-            self._senders[sender] = _datagrams("127.0.0.1", 0)
-        return self._senders[sender]
+        with self._lock:
+            if sender not in self._senders:
+                if len(self._senders) == _SENDERS:
+                    self._senders.pop(next(iter(self._senders))).close()
+                self._senders[sender] = _datagrams("127.0.0.1", 0)
+            return self._senders[sender]
 
 
 def _datagrams(address: str, port: int) -> socket.socket:
@@ -266,8 +270,11 @@ class Live:
                     raise Expired(f"{why}: not within {seconds:g} s: {state}")
                 self._changed.wait(min(deadline.left, 1))
 
-    def heard(self, name: str, forward: socket.socket, port: int, payload: bytes) -> None:
-        """A robot told its station something: it reaches what listens on this computer, if anything does."""
+    def heard(self, name: str, commands: Commands, forward: socket.socket, port: int, payload: bytes) -> None:
+        """A robot told its station something: it reaches who commands it, or what listens on this computer, if anything
+        does."""
+        if commands.answer(port, payload):
+            return
         with suppress(ConnectionRefusedError):
             forward.sendto(payload, (self.station_address, port))
         with self._changed:
@@ -320,7 +327,7 @@ def robots(
             stack.callback(commands.close)
             forward = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             forward.bind((address, 0))
-            cable = Cable(wire, station, functools.partial(live.heard, robot.name, forward))
+            cable = Cable(wire, station, functools.partial(live.heard, robot.name, commands, forward))
             stack.callback(cable.close)
             port = segment.ssh_port(robot.address)
             shell = stack.enter_context(Ssh(robot, "127.0.0.1", functools.partial(int, port)))

@@ -104,8 +104,9 @@ def test_commands_of_any_sender_here_go_on_from_one_and_answers_come_back() -> N
             assert (datagram, sender[0]) == (b"ahead", "127.0.0.1")
             stations.append((station, sender))
         for number, (station, sender) in enumerate(stations):
-            robot.sendto(b"%d" % number, sender)
+            assert commands.answer(sender[1], b"%d" % number)
             assert station.recvfrom(100) == (b"%d" % number, (str(subnet[1]), COMMAND_PORT))
+        assert not commands.answer(COMMAND_PORT, b"report")
 
 
 def test_many_senders_of_commands_are_carried() -> None:
@@ -120,5 +121,5 @@ def test_many_senders_of_commands_are_carried() -> None:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
                 station.settimeout(60)
                 station.sendto(b"ahead", (str(subnet[1]), COMMAND_PORT))
-                robot.sendto(b"heard", robot.recvfrom(100)[1])
+                assert commands.answer(robot.recvfrom(100)[1][1], b"heard")
                 assert station.recv(100) == b"heard"
