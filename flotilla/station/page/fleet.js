@@ -104,7 +104,6 @@ export class Fleet {
     for (const stream of own) {
       const row = state.streams[stream.topic];
       if (row.charge !== null) parts.push(["battery", `${Math.round(100 * row.charge)} %`, row.charge < LOW_CHARGE]);
-      if (row.refusals) parts.push([stream.task, `refused ${row.refusals}`, true]);
       for (const flag of row.bad) parts.push([stream.task, `not ${flag}`, true]);
     }
     const pose = state.poses[robot.name];
@@ -116,6 +115,11 @@ export class Fleet {
     const lately = tasks.reduce((sum, task) => sum + (task.lately ?? 0), 0);
     if (tasks.some((task) => task.overruns !== null)) {
       parts.push(["overruns", `${overruns}${lately ? ` (+${lately})` : ""}`, lately > 0]);
+    }
+    // No alarm: each first message after a start is refused, too.
+    for (const stream of own) {
+      const { refusals } = state.streams[stream.topic];
+      if (refusals) parts.push([stream.task, `refused ${refusals}`, false]);
     }
     const shown = parts.map((part) => part.join(" ")).join("|");
     if (card.figures.dataset.shown === shown) return;
