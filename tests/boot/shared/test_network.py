@@ -48,9 +48,9 @@ def test_nobody_without_the_key_tells_the_time(robot: RobotGuest, fleet: Fleet) 
     """By a neighbour with another robot's address. Seen to fail for a configuration whose servers have no key."""
     other = next(each for each in fleet.robots.values() if each != robot.robot)
     key = message_keys.read().time(robot.robot, other)
-    found = call(robot, time_server, str(other.address), str(robot.robot.address), f"{key}\n", timeout=300)
+    found = call(robot, time_server, str(other.address), str(robot.robot.address), f"{key}\n", timeout=2400)
     for kind in ("none", "wrong"):
         answers, taken = found[kind]
         assert answers >= time_server.ENOUGH
         assert taken == 0, f"{kind}: {taken} of {answers} taken"
-    assert found["right"][1] >= time_server.ENOUGH - 1
+    assert found["right"][1] >= time_server.ENOUGH

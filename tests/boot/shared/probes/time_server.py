@@ -15,9 +15,12 @@ from pathlib import Path
 
 KEYS = "/tmp/neighbour.keys"
 CONFIGURATION = "/tmp/neighbour.conf"
-PATIENCE_S = 60
+PATIENCE_S = 600
+"""For what takes a few seconds; finite, and generous to a busy host."""
 ENOUGH = 3
 """Answers of a kind."""
+CAME, TAKEN = 0, 1
+"""Which of `heard`."""
 
 
 def run(command: str) -> str:
@@ -36,11 +39,11 @@ def heard(address: str) -> tuple[int, int]:
     return int(counts["Total RX"]), int(counts["Total valid RX"])
 
 
-def ask(address: str, answers: int) -> tuple[int, int]:
-    """Have chronyd ask until so many answers more have come; how many came, and were taken."""
+def ask(address: str, what: int) -> tuple[int, int]:
+    """Have chronyd ask until so many more answers came, or were taken; how many came, and were taken."""
     before = heard(address)
     end = time.monotonic() + PATIENCE_S
-    while (now := heard(address))[0] < before[0] + answers:
+    while (now := heard(address))[what] < before[what] + ENOUGH:
         assert time.monotonic() < end, f"no answer of {address}"
         subprocess.run(["chronyc", "-n", "burst", "1/1", address], stdout=subprocess.DEVNULL)
         time.sleep(0.2)  # chronyd has no event for an answer
@@ -89,7 +92,7 @@ def main(address: str, robot: str, keys: str) -> dict[str, tuple[int, int]]:
                 enter(away.fileno())
                 liar(serving, address, proof)
                 enter(home.fileno())
-                found[name] = ask(address, ENOUGH)
+                found[name] = ask(address, CAME)
         Path(KEYS).write_text(keys)
         Path(CONFIGURATION).write_text(
             f"keyfile {KEYS}\nlocal stratum 1\nallow\nbindcmdaddress /\ncmdport 0\npidfile /tmp/neighbour.pid\n"
@@ -99,5 +102,5 @@ def main(address: str, robot: str, keys: str) -> dict[str, tuple[int, int]]:
         )
         cleanup.callback(server.wait)
         cleanup.callback(server.terminate)
-        found["right"] = ask(address, ENOUGH)
+        found["right"] = ask(address, TAKEN)
     return found
