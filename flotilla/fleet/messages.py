@@ -123,12 +123,10 @@ def _streams(name: str, message: Message, messages: Messages) -> Iterator[Findin
             count = message.signals.get(counted)
             if not count or count.width > 1 or "int" not in count.type:
                 yield ("attempts", index), "is not a signal of one integer", "one of signals, or remove it"
-    elif message.foxglove:
-        yield ("foxglove",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
-    elif message.attempts:
-        yield ("attempts",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
-    elif message.charge:
-        yield ("charge",), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
+        return
+    for key in ("foxglove", "attempts", "charge"):
+        if getattr(message, key):
+            yield (key,), f"{message.receiver} has no use for it", f"remove it: it is for receiver: {STATIONS}"
 
 
 def _drawings(name: str, message: Message, messages: Messages) -> Iterator[Finding]:

@@ -325,13 +325,12 @@ class Driving:
 
     def _listen(self) -> None:
         """To all that has come, within bounds."""
-        for _ in range(_AT_ONCE if self._socket else 0):
-            assert self._socket
-            try:
+        if not self._socket:
+            return
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(_AT_ONCE):
                 datagram, (address, _) = self._socket.recvfrom(_LONGEST)
-            except OSError:  # there is nothing more, or nobody took the last command
-                return
-            self.hear(datagram, address)
+                self.hear(datagram, address)
 
     def _channel(self, robot: str) -> _Channel:
         if robot not in self._channels:

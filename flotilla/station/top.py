@@ -219,8 +219,11 @@ class Top:
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 1, 0, 0))
         for title in (*_TITLES, *_ASKED) if self._states else _TITLES:
             table.add_column(title, justify="left" if title in _LEFT else "right")
+        notes = []
         for stream in self._known:
             row, count = self._stats[stream.topic].row(now_ns), self._receiver.counts[stream.topic]
+            if row.refusals:
+                notes.append(f"{stream.robot}: {stream.task} refused messages: {row.refusals}")
             silent = row.silent(stream)
             sent = count.received + (row.lost or 0)
             table.add_row(
@@ -246,10 +249,6 @@ class Top:
             table.add_row(robot, task, period, *[""] * (len(_TITLES) - 3), *_asked(state))
         if chosen is not None:
             table.rows[chosen].style = "reverse"
-        rows = {stream: self._stats[stream.topic].row(now_ns) for stream in self._known}
-        notes = [
-            f"{each.robot}: {each.task} refused messages: {row.refusals}" for each, row in rows.items() if row.refusals
-        ]
         notes += [f"{robot}: radio {said}" for robot, said in sorted(self._cells.items()) if said]
         if self._receiver.strangers:
             notes.append(f"{self._receiver.strangers} datagrams of strangers left out")

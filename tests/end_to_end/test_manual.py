@@ -152,8 +152,8 @@ ELSEWHERE = {
     "make latency-accept": "changes what tests compare with",
 }
 """Commands that need hardware, a terminal or time, with who does the like."""
-DEAR = ("make fleet N=2", "make provision ON=guests", "make fleet-status", "make fleet-down", "make scenarios")
-"""Run nightly: guests that test_fleet.py has each time, and a flight as test_scenarios.py flies it each time."""
+NIGHTLY = ("make fleet N=2", "make provision ON=guests", "make fleet-status", "make fleet-down", "make scenarios")
+"""They take minutes: guests that test_fleet.py has each time, and a flight as test_scenarios.py flies it each time."""
 BEGINNINGS = ("make ", "build/runtime/flotilla-", "mkdir -p build/")
 """Of commands that are ours to run."""
 SHOWN = {
@@ -219,8 +219,8 @@ def run(command: str) -> subprocess.CompletedProcess[str]:
 def left_to_run() -> list[Any]:
     """Of the pages, without what the tutorial's test runs."""
     others = [command for command in commands(*PAGES) if command not in {*ELSEWHERE, *commands(TUTORIAL)}]
-    others += [command for command in commands(TUTORIAL) if command in DEAR]
-    return [pytest.param(each, marks=[pytest.mark.nightly] if each in DEAR else []) for each in others]
+    others += [command for command in commands(TUTORIAL) if command in NIGHTLY]
+    return [pytest.param(each, marks=[pytest.mark.nightly] if each in NIGHTLY else []) for each in others]
 
 
 @pytest.mark.parametrize("command", left_to_run())
@@ -232,7 +232,7 @@ def test_command(command: str, flotilla_run: Path) -> None:
 def test_no_reason_outlives_its_command() -> None:
     assert set(ELSEWHERE) <= set(commands(*PAGES))
     assert {*SHOWN, BOOT} <= set(commands(TUTORIAL))
-    assert set(DEAR) <= set(commands(*PAGES, TUTORIAL))
+    assert set(NIGHTLY) <= set(commands(*PAGES, TUTORIAL))
     assert not set(ELSEWHERE) & set(commands(TUTORIAL)), "the tutorial is run as it stands"
 
 
@@ -303,7 +303,7 @@ def follow(blocks: list[Code]) -> None:
             assert block.file.exists(), f"{block.file}: the page makes it before it is changed"
             block.file.write_text(block.text)
         for command in block.commands:
-            if command in DEAR:
+            if command in NIGHTLY:
                 continue
             assert command.startswith(BEGINNINGS)
             assert SHOWN.get(command, "") in run(command).stdout, command

@@ -276,7 +276,7 @@ def test_a_release_on_trial_takes_no_other(robot: Robot, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("flips", [100, pytest.param(1000, marks=pytest.mark.nightly)])
-def test_each_of_a_thousand_flipped_bits_is_refused(robot: Robot, flips: int) -> None:
+def test_each_flipped_bit_is_refused(robot: Robot, flips: int) -> None:
     """In the manifest, in the signatures and in the content. Seen to fail where chunks are not compared."""
     chance = random.Random(SEED)
     text = manifest_of(robot.blob, header_of(robot.blob))

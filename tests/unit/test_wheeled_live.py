@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import socket
 import struct
-from contextlib import ExitStack
+from collections.abc import Iterator
+from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 
@@ -85,41 +86,52 @@ def test_what_the_plant_tells_is_read_as_it_is_packed() -> None:
     assert length == struct.calcsize("<3d2ddI3d3?I")
 
 
-def test_commands_of_any_sender_here_go_on_from_one_and_answers_come_back() -> None:
+@dataclass(frozen=True)
+class Relay:
+    """A robot's address here, and the robot behind it."""
+
+    commands: live.Commands
+    here: tuple[str, int]
+    robot: socket.socket
+
+
+@pytest.fixture
+def relay() -> Iterator[Relay]:
+    with live._loopback() as subnet, datagrams() as robot:
+        commands = live.Commands(str(subnet[1]), robot.getsockname()[1])
+        try:
+            yield Relay(commands, (str(subnet[1]), COMMAND_PORT), robot)
+        finally:
+            commands.close()
+
+
+def datagrams(address: str = "127.0.0.1") -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.bind((address, 0))
+    made.settimeout(60)
+    return made
+
+
+def test_commands_of_any_sender_here_go_on_from_one_and_answers_come_back(relay: Relay) -> None:
     """To each its own. Seen to fail, in a guest, where QEMU itself listened: the robot refused those of the station's
     address here."""
-    with live._loopback() as subnet, ExitStack() as stack:
-        robot = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        robot.bind(("127.0.0.1", 0))
-        robot.settimeout(60)
-        commands = live.Commands(str(subnet[1]), robot.getsockname()[1])
-        stack.callback(commands.close)
-        stations = []
-        for address in ("127.0.0.1", "127.43.9.254"):
-            station = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            station.bind((address, 0))
-            station.settimeout(60)
-            station.sendto(b"ahead", (str(subnet[1]), COMMAND_PORT))
-            datagram, sender = robot.recvfrom(100)
-            assert (datagram, sender[0]) == (b"ahead", "127.0.0.1")
-            stations.append((station, sender))
-        for number, (station, sender) in enumerate(stations):
-            assert commands.answer(sender[1], b"%d" % number)
-            assert station.recvfrom(100) == (b"%d" % number, (str(subnet[1]), COMMAND_PORT))
-        assert not commands.answer(COMMAND_PORT, b"report")
+    with datagrams() as one, datagrams("127.43.9.254") as other:
+        ports = []
+        for station in (one, other):
+            station.sendto(b"ahead", relay.here)
+            datagram, (address, port) = relay.robot.recvfrom(100)
+            assert (datagram, address) == (b"ahead", "127.0.0.1")
+            ports.append(port)
+        for number, (station, port) in enumerate(zip((one, other), ports, strict=True)):
+            assert relay.commands.answer(port, b"%d" % number)
+            assert station.recvfrom(100) == (b"%d" % number, relay.here)
+    assert not relay.commands.answer(COMMAND_PORT, b"report")
 
 
-def test_many_senders_of_commands_are_carried() -> None:
+def test_many_senders_of_commands_are_carried(relay: Relay) -> None:
     """More than are remembered."""
-    with live._loopback() as subnet, ExitStack() as stack:
-        robot = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        robot.bind(("127.0.0.1", 0))
-        robot.settimeout(60)
-        commands = live.Commands(str(subnet[1]), robot.getsockname()[1])
-        stack.callback(commands.close)
-        for _ in range(3 * live._SENDERS):
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
-                station.settimeout(60)
-                station.sendto(b"ahead", (str(subnet[1]), COMMAND_PORT))
-                assert commands.answer(robot.recvfrom(100)[1][1], b"heard")
-                assert station.recv(100) == b"heard"
+    for _ in range(3 * live._SENDERS):
+        with datagrams() as station:
+            station.sendto(b"ahead", relay.here)
+            assert relay.commands.answer(relay.robot.recvfrom(100)[1][1], b"heard")
+            assert station.recv(100) == b"heard"
