@@ -178,11 +178,11 @@ test-all: test ## the same, and tests that take minutes for one answer
 
 .PHONY: test-kernel test-clock test-others
 run_tests = $(VENV)/bin/pytest tests --durations=20 --durations-min=10
-measured = $(PYTHON) -m tests.costs run
-cost = nice -n 10 $(measured)
+accounted = $(PYTHON) -m tests.costs run
+cost = nice -n 10 $(accounted)
 selected = $(or $(TIER),not nightly)
 test-kernel: | setup-tests
-	$(Q)nice -n 5 $(measured) kernel $(FLOTILLA) kernel
+	$(Q)nice -n 5 $(accounted) kernel $(FLOTILLA) kernel
 
 test-clock: | setup-tests
 	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory runtime

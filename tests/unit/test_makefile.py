@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -105,6 +106,13 @@ def test_what_is_given_as_words_is_no_command(tmp_path: Path, target: str) -> No
     assert [word for word in words if "check" in word or "touch" in word or str(file) in word] == [
         "--check", "x;touch", f"{file}", "`touch", f"{file}`"
     ]  # fmt: skip
+
+
+def test_each_variable_is_defined_once() -> None:
+    """Seen to fail: of two named `measured`, the one that ran the tests' lanes meant the later one's words."""
+    defined = re.findall(r"^([A-Za-z_]+) *[:?]?= ", (paths.PROJECT / "Makefile").read_text(), re.MULTILINE)
+    assert {name for name in defined if defined.count(name) > 1} == set()
+    assert "COSTS" in defined
 
 
 @pytest.mark.parametrize("name", ["BUILD", "KEYS", "APPS"])
