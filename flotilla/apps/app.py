@@ -65,6 +65,8 @@ class Make(_Description):
     notify: bool = False
     """`true`: the program uses sd_notify(3). It sends READY=1 when it is ready, and systemd ends it after a second
     without WATCHDOG=1."""
+    io_ports: bool = False
+    """`true`: the program drives I/O ports (ioperm(2)). Not needed where `safe.yml` has a block that does."""
 
 
 class Ert(_Description):

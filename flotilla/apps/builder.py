@@ -8,9 +8,12 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import yaml
+
 from flotilla.apps import app, ert, fmu
 from flotilla.common import cache, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.fleet import privileges
 from flotilla.fleet.model import Board
 from images.builder import runtime, toolchain
 
@@ -49,8 +52,16 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
                 _fmu(subject, description, board.architecture, out, run)
             else:
                 _blocks(subject, subject.directory, runtime.WARNINGS, board.architecture, out, run)
+            _allow(description, out)
         except UserError as error:
             raise UserError(f"{paths.shown(subject.directory)}: nothing was built: {error}") from None
+
+
+def _allow(description: app.Description, out: Path) -> None:
+    """The privileges that the app's service needs."""
+    tasks = [yaml.safe_load(task.read_text()) for name in (app.TASK, app.SAFE) if (task := out / name).exists()]
+    if any(map(privileges.drives_io_ports, tasks)) or (isinstance(description, app.Make) and description.io_ports):
+        (out / "unit.d" / privileges.DROP_IN).write_text(privileges.IO_PORTS)
 
 
 def _blocks(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import apps, interfaces, keys, message_keys, transport
+from flotilla.fleet import apps, interfaces, keys, message_keys, privileges, transport
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Fleet, Host, Robot
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 TASKS = PurePosixPath("/etc/flotilla/tasks")
 """Where a robot's control tasks lie on it."""
+_DROP_INS = PurePosixPath("/etc/systemd/system")
 _CAN = PurePosixPath("etc/systemd/network/20-can.network.j2")
 """Rendered for each CAN interface of the robot, with its name in the file's."""
 _PRIVATE = dict.fromkeys(("ssh_host_ed25519_key.j2", f"{message_keys.CREDENTIAL}.j2", "chrony.keys.j2"), 0o600)
@@ -113,23 +114,32 @@ def render(fleet: Fleet, robot: Robot, built: Sequence[BuiltApp] = ()) -> dict[P
                 raise UserError(f"{paths.shown(template)}: {error}") from error
             if content.strip():
                 files[PurePosixPath("/") / path] = (content, _PRIVATE.get(template.name, 0o644))
-    files |= {TASKS / f"{name}.yml": (task, 0o644) for name, task in control_tasks(fleet, robot).items()}
+    for task_name, (task, description) in _control_tasks(fleet, robot).items():
+        files[TASKS / f"{task_name}.yml"] = (task, 0o644)
+        if privileges.drives_io_ports(description):
+            drop_in = _DROP_INS / f"flotilla-task@{task_name}.service.d" / privileges.DROP_IN
+            files[drop_in] = (privileges.IO_PORTS.encode(), 0o644)
     return files | apps.listings(built)
 
 
 def control_tasks(fleet: Fleet, robot: Robot) -> dict[str, bytes]:
     """The robot's control tasks by name. Without keys: whoever only reads a description pins nothing."""
+    return {name: task for name, (task, _) in _control_tasks(fleet, robot).items()}
+
+
+def _control_tasks(fleet: Fleet, robot: Robot) -> dict[str, tuple[bytes, object]]:
+    """Each rendered, and parsed."""
     values = _description(fleet, robot)
     message = functools.partial(transport.hop, fleet, robot)
     tasks = {name: _task(name, values | {"message": functools.partial(message, name)}) for name in robot.control_tasks}
+    parsed = {name: _parsed(task) for name, task in tasks.items()}
     problems = []
-    for name, task in tasks.items():
-        description = _parsed(task)
+    for name, description in parsed.items():
         found = [*interfaces.problems(description, fleet, robot), *transport.problems(fleet, name, description)]
         problems += [f"{paths.shown(paths.TASKS / f'{name}.yml')}: {problem}" for problem in found]
     if problems:
         raise UserError("\n".join(problems))
-    return tasks
+    return {name: (task, parsed[name]) for name, task in tasks.items()}
 
 
 def _task(name: str, values: dict[str, object]) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,6 +48,6 @@ def _table() -> list[tuple[str, str]]:
 def role_of(path: str) -> str:
     """The role that looks after a file of a robot."""
     for place, role in _table():
-        if path == place or (place.endswith("/") and path.startswith(place)):
+        if fnmatch.fnmatchcase(path, f"{place}*" if place.endswith("/") else place):
             return role
     raise UserError(f"{path}: no role looks after it; add it to {paths.shown(ROLES)}")

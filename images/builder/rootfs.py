@@ -286,9 +286,15 @@ def _lay_overlay(target: Path) -> None:
 def _configure(stage: Stage, console: str) -> None:
     """Accounts, services, the console's log-in and mount points: what the overlay's files cannot say by themselves."""
     stage.in_target("groupadd", "--system", "realtime")
+    # Whom control tasks and apps run as: numbers of their own, because the data partition outlives releases.
+    for name, number in (("control", "901"), ("app", "902")):
+        stage.in_target(
+            "useradd", "--system", "--uid", number, "--user-group", "--no-create-home", "--home-dir", "/nonexistent",
+            "--shell", "/usr/sbin/nologin", name,
+        )  # fmt: skip
     stage.in_target(
         "useradd", "--uid", "1000", "--user-group", "--no-create-home", "--home-dir", "/home/robot",
-        "--shell", "/bin/bash", "--groups", "dialout,video,realtime", "robot",
+        "--shell", "/bin/bash", "--groups", "dialout,video,realtime,control,app", "robot",
     )  # fmt: skip
     stage.in_target("systemctl", "preset-all", "--preset-mode=full")
     stage.in_target("systemctl", "set-default", "multi-user.target")

@@ -322,7 +322,7 @@ static int listening(const char *path)
         return -1;
     if (left_behind(&address))
         unlink(path);
-    if (fchmod(fd, 0600) == 0 /* before it has a name */
+    if (fchmod(fd, 0660) == 0 /* before it has a name; the umask says whether the group may */
         && bind(fd, (const struct sockaddr *)&address, sizeof address) == 0 && listen(fd, QUEUED) == 0)
         return fd;
     int error = errno;

@@ -24,8 +24,8 @@ int task_socket_connect(const char *task, const char *path)
     if (errno == ENOENT || errno == ECONNREFUSED)
         fprintf(stderr, "%s: no task %s runs here: nobody listens at %s\n", program_invocation_short_name, task, path);
     else if (errno == EACCES)
-        fprintf(stderr, "%s: %s: only the user who runs task %s may, and root\n", program_invocation_short_name, path,
-                task);
+        fprintf(stderr, "%s: %s: task %s answers the user that it runs as, that user's group, and root only\n",
+                program_invocation_short_name, path, task);
     else
         fprintf(stderr, "%s: %s: %s\n", program_invocation_short_name, path, strerror(errno));
     return -1;

@@ -32,6 +32,36 @@ from tests.conftest import RobotGuest
 UNIT = "flotilla-task@heading.service"
 TASK = paths.TASKS / "heading.yml"
 INERTIA_KG_M2 = 0.25
+CONTROL, APP = 901, 902
+"""Users of control tasks and of apps."""
+SECONDS = 120
+OWN_TASKS = {
+    "kill -0 {target}",
+    "flotilla-param heading attitude.kp",
+    "ls /var/lib/flotilla/heading",
+    "head -c 1 /run/credentials/flotilla-task@heading.service/message-keys",
+}
+"""What control tasks may do to each other, which run as one user."""
+ATTEMPTS = OWN_TASKS | {
+    "cat /proc/{target}/environ",
+    "head -c 1 /etc/flotilla/message-keys",
+    "head -c 1 /etc/chrony/chrony.keys",
+    "head -c 1 /etc/ssh/ssh_host_ed25519_key",
+    "test -w /etc/ssh/authorized_keys/robot",
+    "test -w /home/robot",
+    "test -w /etc/systemd/system",
+    "test -w /run/systemd/system",
+    "test -w /etc/flotilla/tasks/heading.yml",
+    "test -w /data",
+    "test -w /dev/watchdog0",
+    "test -r /dev/sda",
+    "test -w /dev/mem",
+    "test -w /proc/sysrq-trigger",
+    "kill -0 1",
+    "kill -0 $(pidof -s sshd)",
+    "sudo -n true",
+    "systemctl reset-failed flotilla-task@heading.service",
+}
 
 
 class Plant:
@@ -193,10 +223,37 @@ def test_the_task_has_only_the_privileges_it_needs(loop: Loop) -> None:
     cap_sys_rawio = 1 << 17
     for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"):
         assert int(fields[name], 16) == cap_sys_rawio, name
-    assert fields["Uid"].split() == ["1000"] * 4
+    assert fields["Uid"].split() == [str(CONTROL)] * 4
     assert fields["NoNewPrivs"].strip() == "1"
     assert "VmLck" in fields
     assert not fields["VmLck"].startswith("       0"), "memory is not locked"
+    others = ["systemctl", "show", "-p", "CapabilityBoundingSet,AmbientCapabilities", "flotilla-task@control.service"]
+    shown = loop.robot.shell.run(others).stdout.splitlines()
+    assert sorted(shown) == ["AmbientCapabilities=", "CapabilityBoundingSet="], "it drives no I/O ports"
+
+
+def attempted(loop: Loop, *user: str) -> set[str]:
+    """What succeeds as a user, of what somebody tries who has taken over a task. None of it changes anything."""
+    target = loop.main_pid()
+    script = "\n".join(f"({each.format(target=target)}) >/dev/null 2>&1 && echo '{each}'" for each in ATTEMPTS)
+    said = loop.robot.shell.run(["sudo", *user, "sh"], stdin=f"{script}\ntrue\n", timeout=SECONDS).stdout
+    return set(said.splitlines())
+
+
+def test_who_takes_over_a_task_or_an_app_takes_over_nothing_else(loop: Loop) -> None:
+    """With a task's user, groups and privileges. Seen to fail as user `robot`, whom tasks once ran as: it could leave
+    commands to the operator's next shell, who may become root, and trace that shell."""
+    status = loop.robot.shell.run(["cat", f"/proc/{loop.main_pid()}/status"]).stdout
+    (found,) = re.findall(r"^Groups:\t(.*)$", status, re.MULTILINE)
+
+    def as_user(number: int) -> list[str]:
+        groups = [each for each in found.split() if each != str(CONTROL)] + [str(number)]
+        own = [f"--reuid={number}", f"--regid={number}", f"--groups={','.join(groups)}"]
+        return ["setpriv", *own, "--bounding-set=-all", "--no-new-privs"]
+
+    assert attempted(loop) == set(ATTEMPTS), "root may, so these are attempts"
+    assert attempted(loop, *as_user(CONTROL)) == OWN_TASKS
+    assert attempted(loop, *as_user(APP)) == set()
 
 
 def test_the_control_thread_is_real_time(loop: Loop) -> None:
@@ -244,7 +301,7 @@ def test_parameters_are_the_users_of_the_task_alone(loop: Loop) -> None:
     argv = ["sudo", "-u", "nobody", "flotilla-param", "heading", "attitude.kp", "1"]
     refused = loop.robot.shell.run(argv, check=False)
     assert (refused.returncode, refused.stdout) == (1, "")
-    assert "only the user who runs task heading may" in refused.stderr
+    assert "task heading answers the user that it runs as" in refused.stderr
 
 
 def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:

@@ -147,7 +147,7 @@ def test_a_program_that_ignores_sigterm_is_ended_and_its_relays_are_reset(bench:
     """Without safe.yml they stay on, and are off only once the next version is there and has ended."""
     directory = bench.new("make", "stubborn")
     (directory / "main.c").write_text(STUBBORN)
-    (directory / "app.yml").write_text(f"kind: make\nprogram: stubborn\narguments: ['{SAID}']\n")
+    (directory / "app.yml").write_text(f"kind: make\nprogram: stubborn\nio_ports: true\narguments: ['{SAID}']\n")
     bench.place(directory)
     bench.do("stubborn", "start")
     assert bench.relays.wait_relays(on=True), "the program does not start"

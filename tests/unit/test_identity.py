@@ -55,6 +55,18 @@ def test_tasks_start_with_the_robot(fleet: Fleet) -> None:
     assert "period: 10 ms" in _text(fleet, fleet.robots[1], "/etc/flotilla/tasks/heading.yml")
 
 
+@pytest.mark.parametrize("transport", ["udp", "dds"])
+def test_only_what_drives_io_ports_may(transport: str) -> None:
+    """Seen to fail with the privilege in the template of all services, and with another type in the table."""
+    flying = virtual.fleet(transport)
+    rendered = {path for robot in flying.robots.values() for path in identity.render(flying, robot)}
+    allowed = {path.parent.name for path in rendered if path.name == "io-ports.conf"}
+    assert allowed == {"flotilla-task@valves.service.d"}
+    shared = (paths.PROJECT / "runtime" / "systemd" / "flotilla-control@.service.in").read_text().splitlines()
+    assert "CapabilityBoundingSet=" in shared
+    assert not any(line.startswith("AmbientCapabilities") for line in shared)
+
+
 def test_a_task_talks_to_the_one_robot_that_has_the_other(fleet: Fleet) -> None:
     def rendered(tasks: dict[int, list[str]], transport: str) -> str:
         robots = {number: fleet.robots[number].model_copy(update={"control_tasks": tasks[number]}) for number in tasks}
