@@ -14,6 +14,7 @@ from flotilla.common.errors import UserError
 _COMMANDS = {
     "chroot": "coreutils",
     "dpkg-deb": "dpkg",
+    "git": "git",
     "mount": "mount",
     "setpriv": "util-linux",
     "ssh-keygen": "openssh-client",

@@ -1,4 +1,5 @@
-"""Kernels of our own: Debian's packaged source, configured by the fragments in `kernel/`, built by the locked compiler.
+"""Kernels of our own: Debian's packaged source with the patches in `kernel/`, configured by the fragments there, built by
+the locked compiler.
 
 `kernel/NAME.yml` says which fragments make the kernel NAME. Whatever no fragment asks for is off; whatever one asks for
 must be in the final configuration, or the build fails and says why: kconfig itself drops an option silently when
@@ -45,6 +46,8 @@ class Recipe(pydantic.BaseModel):
     """Debian's name of the processor architecture."""
     fragments: tuple[str, ...]
     """Names of files in `kernel/fragments/`, without `.config`. No two set an option differently."""
+    patches: tuple[str, ...] = ()
+    """Names of files in `kernel/patches/`, without `.patch`, in the order in which they are applied."""
     modules: bool = True
     """`false`: leave the modules out. The kernel itself is the same without them."""
     files: int = pydantic.Field(gt=0)
@@ -177,6 +180,16 @@ def wanted(name: str) -> dict[str, Option]:
     )
 
 
+def patches(name: str) -> list[Path]:
+    """The patches of a kernel's source."""
+    files = [paths.KERNELS / "patches" / f"{patch}.patch" for patch in recipe(name).patches]
+    for file in files:
+        if not file.is_file():
+            there = ", ".join(sorted(each.stem for each in file.parent.glob("*.patch")))
+            raise UserError(f"{paths.shown(file)}: no such patch; there are {there}")
+    return files
+
+
 def request(options: Iterable[Option]) -> str:
     """The options as kconfig reads them."""
     return "".join(
@@ -250,7 +263,7 @@ def build(name: str) -> Kernel:
         log = paths.BUILD / f"kernel-{name}.log"
         stage = kernel_stage.Description(
             tools=str(toolchain), out=str(out), architecture=recipe(name).architecture, source=origin.name,
-            version=origin.version, epoch=lock.epoch, modules=modules,
+            version=origin.version, epoch=lock.epoch, modules=modules, patches=[str(patch) for patch in patches(name)],
         )  # fmt: skip
         (out / "request.config").write_text(request(options.values()))
         with progress.step(f"configure kernel {name}"):
@@ -270,7 +283,9 @@ def key(name: str) -> str:
     made_by = [Path(kernel_stage.__file__), Path(kernel_stage.__file__).with_name("chroot.py")]
     made_of = recipe(name)
     options = request(wanted(name).values())
-    return cache.digest(lock.digest, made_of.architecture, options, f"modules {made_of.modules}", *made_by)
+    return cache.digest(
+        lock.digest, made_of.architecture, options, f"modules {made_of.modules}", *patches(name), *made_by
+    )
 
 
 def unbuilt(names: Iterable[str]) -> list[str]:

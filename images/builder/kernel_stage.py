@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +44,18 @@ class Description:
     epoch: int
     modules: bool
     """Whether the package holds modules, too."""
+    patches: Sequence[str]
+    """Files, in the order in which they are applied to the source."""
+
+
+def apply(patches: Sequence[str], source: Path, what: str) -> None:
+    """Apply patches to a source, exactly; SystemExit with the one that does not fit `what`."""
+    # Without a repository above, whose folder git would take the paths to be in.
+    environment = os.environ | {"GIT_CEILING_DIRECTORIES": str(source.parent)}
+    for patch in patches:
+        argv = ["git", "apply", "--whitespace=nowarn", patch]
+        if subprocess.run(argv, cwd=source, env=environment, check=False).returncode:
+            raise SystemExit(f"{patch}: does not apply to {what}; bring it up to date, or take it out of `patches`")
 
 
 class Stage:
@@ -65,7 +79,7 @@ class Stage:
         self.chroot.provide_system(out=self.out)
 
     def configure(self) -> None:
-        """Unpack the source; leave `config`, what kconfig makes of the request, and `kconfig`, its own texts."""
+        """Unpack and patch the source; leave `config`, what kconfig makes of the request, and `kconfig`, its texts."""
         archive = f"/usr/src/{self.description.source}.tar.xz"
         (self.out / "source").mkdir()
         (self.out / "objects").mkdir()
@@ -73,6 +87,8 @@ class Stage:
         self.chroot.run(
             "tar", "-I", "xz -T0", "-xf", archive, "-C", "/out/source", "--strip-components=1", "--wildcards", *unused
         )
+        what = f"{self.description.source} {self.description.version}"
+        apply(self.description.patches, self.out / "source", what)
         self.chroot.run(*self.make, "-s", "allnoconfig")
         shutil.copy(self.out / "objects/.config", self.out / "config")
         files = sorted(path for path in (self.out / "source").rglob("Kconfig*") if path.is_file())

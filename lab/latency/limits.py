@@ -8,26 +8,28 @@ from dataclasses import dataclass
 from flotilla.common.errors import UserError
 from lab.latency.results import Results
 from lab.latency.run import VIRTUAL
-from lab.latency.scenarios import CYCLICTEST, IN_STEP, SCENARIOS
+from lab.latency.scenarios import CYCLICTEST, IN_STEP, SCENARIOS, UART_OWN, UART_SHARED
 
 OURS, DEBIANS = "lean", "debian"
 HALF = "what six minutes of building a kernel of one's own have to buy"
 SHARE = 0.5
-"""Of the latest wake-up with Debian's kernel, in the same scenarios on the same machine."""
+"""Of the latest with Debian's kernel, in the same scenarios on the same machine."""
 
 
 @dataclass(frozen=True)
 class Limit:
-    """Of the latest wake-up in any of some scenarios."""
+    """Of the latest in any of some scenarios."""
 
     title: str
     scenarios: tuple[str, ...]
     at_most_us: int
     reason: str
+    quantity: str = "wake-up"
+    """What its meter's histogram is of."""
 
     def worst(self, run: Results) -> tuple[int, str]:
-        """The latest wake-up in µs, and its scenario."""
-        return max((run.scenarios[name].latencies["wake-up"].max_us, name) for name in self.measured(run))
+        """The latest in µs, and its scenario."""
+        return max((run.scenarios[name].latencies[self.quantity].max_us, name) for name in self.measured(run))
 
     def measured(self, run: Results) -> list[str]:
         """Scenarios of it that the run has: the short one has a few, and boards lack devices."""
@@ -53,7 +55,14 @@ TICK = Limit(
     75,
     "the tick comes first, with what it wakes",
 )
-LIMITS = (IDLE, LOADED, TICK)
+BYTES = Limit(
+    "bytes of serial ports",
+    tuple(each.name for each in SCENARIOS if each.meter in (UART_OWN, UART_SHARED)),
+    200,
+    "a fiftieth of a period of 10 ms, and hardly more than two bytes at 115200 Bd",
+    "byte",
+)
+LIMITS = (IDLE, LOADED, TICK, BYTES)
 
 
 @dataclass(frozen=True)

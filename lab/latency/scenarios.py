@@ -155,7 +155,9 @@ SCENARIOS = (
     ),
     Scenario("uart-own", "port with its own interrupt, idle", UART_OWN, share=_SHORT, quick=True),
     Scenario("uart-own-cpu", "port with its own interrupt, computing", UART_OWN, CPU, share=_SHORT),
-    Scenario("uart-own-everything", "port with its own interrupt, everything", UART_OWN, EVERYTHING, share=_SHORT),
+    Scenario(
+        "uart-own-everything", "port with its own interrupt, everything", UART_OWN, EVERYTHING, share=_SHORT, quick=True
+    ),
     Scenario("uart-shared", "port with a shared interrupt, idle", UART_SHARED, share=_SHORT),
     Scenario(
         "uart-shared-everything", "port with a shared interrupt, everything", UART_SHARED, EVERYTHING, share=_SHORT

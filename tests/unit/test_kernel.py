@@ -5,13 +5,16 @@ Seen to fail: each message by leaving out the check it comes from.
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from flotilla.common import paths
 from flotilla.common.errors import ProblemsError, UserError
-from images.builder import kernel
+from images.builder import kernel, kernel_stage
 from images.builder.kernel import Option
 from images.builder.lock import read_lock
 
@@ -62,6 +65,46 @@ def test_missing_fragment_names_those_that_exist(fragment: Callable[[str], Path]
     path = fragment("")
     with pytest.raises(UserError, match=r"other\.config: no such fragment; there are some"):
         kernel.read_fragment(path.with_name("other.config"))
+
+
+PATCH = """\
+About it.
+
+--- a/drivers/tty.c
++++ b/drivers/tty.c
+@@ -1,3 +1,3 @@
+ one
+-two
++second
+ three
+"""
+
+
+def test_a_patch_is_applied_exactly_or_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Inside a repository, too, where a build lies. Seen to fail without the ceiling: git then changes nothing."""
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    source, patch = tmp_path / "build" / "source", tmp_path / "some.patch"
+    (source / "drivers").mkdir(parents=True)
+    patch.write_text(PATCH)
+    (source / "drivers" / "tty.c").write_text("one\ntwo\nthree\n")
+    kernel_stage.apply([str(patch)], source, "linux 6")
+    assert (source / "drivers" / "tty.c").read_text() == "one\nsecond\nthree\n"
+    with pytest.raises(SystemExit, match=r"some\.patch: does not apply to linux 6; bring it up to date"):
+        kernel_stage.apply([str(patch)], source, "linux 6")
+    assert "drivers/tty.c" in capfd.readouterr().err
+
+
+def test_a_patch_decides_what_a_kernel_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(paths.KERNELS, tmp_path / "kernel")
+    monkeypatch.setattr(paths, "KERNELS", tmp_path / "kernel")
+    (patch,) = kernel.patches("smartcoret3")
+    key = kernel.key("smartcoret3")
+    assert kernel.key("smartcoret3-no-rt") != key
+    patch.write_text(patch.read_text() + "\n")
+    assert kernel.key("smartcoret3") != key
+    patch.rename(patch.with_name("other.patch"))
+    with pytest.raises(UserError, match=r"tty-flip-realtime\.patch: no such patch; there are other"):
+        kernel.patches("smartcoret3")
 
 
 def test_contradiction_names_both_places() -> None:
