@@ -1,4 +1,4 @@
-"""Kernels of our own: Debian's packaged source with the patches in `kernel/`, configured by the fragments there, built by
+"""Kernels of our own: Debian's packaged source with patches and configured by fragments, which are in `kernel/`, built by
 the locked compiler.
 
 `kernel/NAME.yml` says which fragments make the kernel NAME. Whatever no fragment asks for is off; whatever one asks for

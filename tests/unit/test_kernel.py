@@ -70,6 +70,7 @@ def test_missing_fragment_names_those_that_exist(fragment: Callable[[str], Path]
 PATCH = """\
 About it.
 
+diff --git a/drivers/tty.c b/drivers/tty.c
 --- a/drivers/tty.c
 +++ b/drivers/tty.c
 @@ -1,3 +1,3 @@
