@@ -1,5 +1,5 @@
-"""Kernels of our own: Debian's packaged source with patches and configured by fragments, which are in `kernel/`, built by
-the locked compiler.
+"""Kernels of our own: Debian's packaged source with the patches, and configured by the fragments, in `kernel/`. The
+locked compiler builds them.
 
 `kernel/NAME.yml` says which fragments make the kernel NAME. Whatever no fragment asks for is off; whatever one asks for
 must be in the final configuration, or the build fails and says why: kconfig itself drops an option silently when
