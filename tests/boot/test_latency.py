@@ -10,7 +10,7 @@ import pytest
 
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
-from lab.latency import gate, machine, run, subject
+from lab.latency import gate, limits, machine, run, subject
 from lab.latency.controls import DELAY_US, NO_RT, Control
 from lab.latency.results import Latency, Results
 from tests.perturb import perturbed_host
@@ -101,6 +101,13 @@ def test_a_bound_notices_a_fault(boards: dict[str, Board], artefacts: Path) -> N
     found = run.measure(boards["lean"], "disk", artefacts, Control(delay="irq"))
     with pytest.raises(UserError, match=r"disk: wake-up: max .* is the bound"):
         gate.check(found, artefacts / "none")
+
+
+def test_a_byte_reaches_its_thread_in_time_under_all_loads(measured: Callable[[str], Results]) -> None:
+    """Seen to fail without the kernel's patch, and with Debian's kernel."""
+    late_us, scenario = limits.BYTES.worst(measured("lean"))
+    assert late_us <= limits.BYTES.at_most_us, scenario
+    assert "uart-own-everything" in limits.BYTES.measured(measured("lean"))
 
 
 def test_the_loads_are_loads(measured: Callable[[str], Results]) -> None:
