@@ -171,7 +171,7 @@ class Ssh:
         self._hang_up()
         # `LocalCommand` runs once the connection stands, so its output is the event to wait for.
         ready = ["-o", "PermitLocalCommand=yes", "-o", "LocalCommand=echo ready"]
-        alive = ["-o", "ConnectTimeout=20", "-o", "ServerAliveInterval=10", "-o", "ServerAliveCountMax=6"]
+        alive = ["-o", "ConnectTimeout=20", "-o", "ServerAliveInterval=10", "-o", "ServerAliveCountMax=18"]
         argv = [*self._within, *DIE_WITH_PARENT, "ssh", "-M", "-N", *ready, *alive, *self._options]
         argv += ["-p", str(self._port()), self._host]
         self._master = subprocess.Popen(

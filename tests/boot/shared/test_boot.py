@@ -25,6 +25,10 @@ HARMLESS = {
     r"tsc: Fast TSC calibration failed": "QEMU's timers on a busy host",
     r"clocksource: .*'(tsc|tsc-early|refined-jiffies|acpi_pm)'": "QEMU's timers on a busy host",
     r"TSC found unstable after boot": "QEMU's timers on a busy host",
+    r"Unstable clock detected, switching default tracing clock": "QEMU's timers on a busy host",
+    r"^ *(If you want to keep using the local clock, then add:|\"trace_clock=local\"|on the kernel command line)$": (
+        "its next lines"
+    ),
     r"hrtimer: interrupt took \d+ ns": "QEMU's timers on a busy host; how late timers are is judged in virtual time",
     r"APIC calibration not consistent with PM-Timer": "QEMU's timers on a busy host",
     r"acpi resource window .* ignored, not CPU addressable": "QEMU's i440FX offers addresses beyond 32 bits",
