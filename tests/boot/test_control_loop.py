@@ -53,7 +53,6 @@ ATTEMPTS = OWN_TASKS | {
     "test -w /run/systemd/system",
     "test -w /etc/flotilla/tasks/heading.yml",
     "test -w /data",
-    "test -w /dev/watchdog0",
     "test -r /dev/sda",
     "test -w /dev/mem",
     "test -w /proc/sysrq-trigger",
@@ -150,7 +149,7 @@ def test_the_task_starts_with_the_robot(loop: Loop) -> None:
     assert loop.unit("ActiveState") == "active"
     journal = ["sudo", "journalctl", "-b", "-o", "cat", "-u", UNIT]
     said = [line for line in loop.robot.shell.run(journal).stdout.splitlines() if line.startswith("flotilla: ")]
-    late = [line for line in said if re.search(r"\d+ in a row", line)]
+    late = [line for line in said if re.search(r"\d+ in a row|no step ended for", line)]
     assert int(loop.unit("NRestarts")) == len(late), said
 
 
@@ -192,14 +191,14 @@ def test_a_stopped_executive_is_ended_by_the_watchdog_and_the_valves_close(loop:
     loop.plant.kick(math.radians(15))
     assert loop.board.wait_relays(on=True)
     pid = loop.main_pid()
-    loop.robot.shell.run(["kill", "-STOP", str(pid)])
+    loop.robot.shell.run(["sudo", "kill", "-STOP", str(pid)])
     assert loop.board.wait_relays(on=False), "valves stay open while the executive is stopped"
     wait_restarted(loop, pid)
 
 
 def test_a_killed_executive_is_restarted(loop: Loop, record_property: Callable[[str, object], None]) -> None:
     pid = loop.main_pid()
-    loop.robot.shell.run(["kill", "-KILL", str(pid)])
+    loop.robot.shell.run(["sudo", "kill", "-KILL", str(pid)])
     wait_restarted(loop, pid)
     loop.plant.kick(math.radians(15))
     assert loop.board.wait_relays(on=True), "the restarted task does not control"
@@ -231,7 +230,8 @@ def test_the_task_has_only_the_privileges_it_needs(loop: Loop) -> None:
     assert fields["NoNewPrivs"].strip() == "1"
     assert "VmLck" in fields
     assert not fields["VmLck"].startswith("       0"), "memory is not locked"
-    others = ["systemctl", "show", "-p", "CapabilityBoundingSet,AmbientCapabilities", "flotilla-task@control.service"]
+    properties = "CapabilityBoundingSet,AmbientCapabilities"
+    others = ["sudo", "systemctl", "show", "-p", properties, "flotilla-task@control.service"]
     shown = loop.robot.shell.run(others).stdout.splitlines()
     assert sorted(shown) == ["AmbientCapabilities=", "CapabilityBoundingSet="], "it drives no I/O ports"
 

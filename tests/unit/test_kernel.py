@@ -98,13 +98,13 @@ def test_a_patch_is_applied_exactly_or_refused(tmp_path: Path, capfd: pytest.Cap
 def test_a_patch_decides_what_a_kernel_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(paths.KERNELS, tmp_path / "kernel")
     monkeypatch.setattr(paths, "KERNELS", tmp_path / "kernel")
-    (patch,) = kernel.patches("smartcoret3")
+    patch, *_ = kernel.patches("smartcoret3")
     key = kernel.key("smartcoret3")
     assert kernel.key("smartcoret3-no-rt") != key
     patch.write_text(patch.read_text() + "\n")
     assert kernel.key("smartcoret3") != key
     patch.rename(patch.with_name("other.patch"))
-    with pytest.raises(UserError, match=r"tty-flip-realtime\.patch: no such patch; there are other"):
+    with pytest.raises(UserError, match=r"tty-flip-realtime\.patch: no such patch; there are other, "):
         kernel.patches("smartcoret3")
 
 
