@@ -58,8 +58,8 @@ TICK = Limit(
 BYTES = Limit(
     "bytes of serial ports",
     tuple(each.name for each in SCENARIOS if each.meter in (UART_OWN, UART_SHARED)),
-    287,
-    "200 µs, a fiftieth of a period of 10 ms, and 87 for which a byte is on the wire at 115200 Bd",
+    200,
+    "a fiftieth of a period of 10 ms, of which a byte is on the wire for 87 µs at 115200 Bd",
     "byte",
 )
 LIMITS = (IDLE, LOADED, TICK, BYTES)
