@@ -67,7 +67,7 @@ mkdir -p {Path(LASER).parent}
 chown control {Path(LASER).parent}
 until ip link show {DRIVES} >/dev/null 2>&1; do sleep 0.2; done
 ip link set {DRIVES} up type can bitrate {BITRATE} restart-ms 100
-systemd-run --quiet --unit=plant -p User=control -p SupplementaryGroups='dialout realtime' -p LimitRTPRIO=99 \\
+systemd-run --quiet --unit=plant -p User=control -p SupplementaryGroups='dialout realtime robot' -p LimitRTPRIO=99 \\
     -p LimitMEMLOCK=infinity -p WorkingDirectory={_THERE} flotilla-run --blocks {_THERE} {_THERE}/plant.yml
 systemd-run --quiet --unit=busy -p CPUSchedulingPolicy=idle sh -c 'while :; do :; done'
 """
