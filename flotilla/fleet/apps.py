@@ -22,7 +22,8 @@ PLACE = PurePosixPath("/data/apps")
 """Where apps lie on a robot: `NAME` is a link to the version beside it. So an app changes at once or not at all."""
 LISTINGS = PurePosixPath("/etc/flotilla/apps")
 """A file for each app that the inventory gave to a robot. What lies in `PLACE` besides was brought there by hand."""
-_SYSTEM = PurePosixPath("/etc/systemd/system")
+SYSTEM = PurePosixPath("/etc/systemd/system")
+"""Units and drop-ins that a robot has of its own."""
 _SERVICE = "/usr/lib/systemd/system/flotilla-app@.service"
 
 
@@ -75,8 +76,8 @@ class BuiltApp:
         unit = f"flotilla-app@{self.name}.service"
         return {
             PLACE / self.name: self.place.name,
-            _SYSTEM / f"{unit}.d": str(PLACE / self.name / "unit.d"),
-            _SYSTEM / "multi-user.target.wants" / unit: _SERVICE,
+            SYSTEM / f"{unit}.d": str(PLACE / self.name / "unit.d"),
+            SYSTEM / "multi-user.target.wants" / unit: _SERVICE,
         }
 
 

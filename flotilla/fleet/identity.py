@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 TASKS = PurePosixPath("/etc/flotilla/tasks")
 """Where a robot's control tasks lie on it."""
-_DROP_INS = PurePosixPath("/etc/systemd/system")
 _CAN = PurePosixPath("etc/systemd/network/20-can.network.j2")
 """Rendered for each CAN interface of the robot, with its name in the file's."""
 _PRIVATE = dict.fromkeys(("ssh_host_ed25519_key.j2", f"{message_keys.CREDENTIAL}.j2", "chrony.keys.j2"), 0o600)
@@ -117,7 +116,7 @@ def render(fleet: Fleet, robot: Robot, built: Sequence[BuiltApp] = ()) -> dict[P
     for task_name, (task, description) in _control_tasks(fleet, robot).items():
         files[TASKS / f"{task_name}.yml"] = (task, 0o644)
         if privileges.drives_io_ports(description):
-            drop_in = _DROP_INS / f"flotilla-task@{task_name}.service.d" / privileges.DROP_IN
+            drop_in = apps.SYSTEM / f"flotilla-task@{task_name}.service.d" / privileges.DROP_IN
             files[drop_in] = (privileges.IO_PORTS.encode(), 0o644)
     return files | apps.listings(built)
 

@@ -71,7 +71,9 @@ systemd-run --quiet --unit=plant -p User=control -p SupplementaryGroups='dialout
     -p LimitMEMLOCK=infinity -p WorkingDirectory={_THERE} flotilla-run --blocks {_THERE} {_THERE}/plant.yml
 systemd-run --quiet --unit=busy -p CPUSchedulingPolicy=idle sh -c 'while :; do :; done'
 """
-"""Both boards are the kernel's to find; only the first is in the inventory, so nobody else sets the second up.
+"""The plant makes the laser's terminal, so it runs as control tasks do; its files are in the folder of user `robot`.
+
+Both boards are the kernel's to find; only the first is in the inventory, so nobody else sets the second up.
 
 While the guest's processor is idle its time is the host's, which a host that stops it makes jump: drives and tasks then
 miss each other's heartbeats. So the processor is kept busy, by what gives way to all else."""

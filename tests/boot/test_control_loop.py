@@ -245,8 +245,8 @@ def attempted(loop: Loop, *user: str) -> set[str]:
 
 
 def test_who_takes_over_a_task_or_an_app_takes_over_nothing_else(loop: Loop) -> None:
-    """With a task's user, groups and privileges. Seen to fail as user `robot`, whom tasks once ran as: it could leave
-    commands to the operator's next shell, who may become root, and trace that shell."""
+    """With a task's user and groups. Seen to fail as user `robot`, whom tasks once ran as: it could write to the
+    operator's home folder, from which the next shell takes commands, and signal sshd."""
     status = loop.robot.shell.run(["cat", f"/proc/{loop.main_pid()}/status"]).stdout
     (found,) = re.findall(r"^Groups:\t(.*)$", status, re.MULTILINE)
 

@@ -57,7 +57,7 @@ def test_tasks_start_with_the_robot(fleet: Fleet) -> None:
 
 @pytest.mark.parametrize("transport", ["udp", "dds"])
 def test_only_what_drives_io_ports_may(transport: str) -> None:
-    """Seen to fail with the privilege in the template of all services, and with another type in the table."""
+    """Seen to fail with the privilege in the template of all services, and with `udp-receive` in the table."""
     flying = virtual.fleet(transport)
     rendered = {path for robot in flying.robots.values() for path in identity.render(flying, robot)}
     allowed = {path.parent.name for path in rendered if path.name == "io-ports.conf"}
