@@ -122,7 +122,7 @@ export class Drive {
     this.flags = make("div", { className: "chips" });
     this.controls = make("div", { className: "body", style: { padding: 0 } },
       make("div", { className: "row" }, this.take, this.ask, this.accept, this.enable, this.leave),
-      this.asking, this.why, this.stick,
+      this.stick, this.asking, this.why, // what comes and goes is beneath the stick, which must not move under a thumb
       make("div", { className: "gauges" },
         make("label", {}, "speed"), make("span"), this.out.speed,
         make("label", {}, "turn"), make("span"), this.out.turn,
