@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import apps, interfaces, keys, message_keys, privileges, transport
+from flotilla.fleet import apps, dds_security, interfaces, keys, message_keys, privileges, transport
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Fleet, Host, Robot
 
@@ -21,7 +21,10 @@ TASKS = PurePosixPath("/etc/flotilla/tasks")
 """Where a robot's control tasks lie on it."""
 _CAN = PurePosixPath("etc/systemd/network/20-can.network.j2")
 """Rendered for each CAN interface of the robot, with its name in the file's."""
-_PRIVATE = dict.fromkeys(("ssh_host_ed25519_key.j2", f"{message_keys.CREDENTIAL}.j2", "chrony.keys.j2"), 0o600)
+_PRIVATE = {
+    f"{name}.j2": 0o600
+    for name in ("ssh_host_ed25519_key", message_keys.CREDENTIAL, dds_security.CREDENTIAL, "chrony.keys")
+}
 """Modes of templates whose result is not for everyone."""
 
 
@@ -63,6 +66,7 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "interface": fleet.interface(robot),
         "dds_ports": f"{first}-{first + 249}",
         "dds_peers": dds_peers(fleet, robot),
+        "dds": dds_security.variables(fleet, robot, shared_keys) if fleet.network.dds_security else {},
         "host_keys": host_keys,
         "revoked_keys": keys.revoked(),
         "host_public_key": host_keys[robot.name],

@@ -7,6 +7,7 @@
 | `NAME_ed25519.retired` | the former one, accepted until it is retired: public of a robot, private of the operator |
 | `revoked_keys` | public host keys that nobody accepts any more, a line each with the robot's name |
 | `fleet_secret` | where keys of messages come from: message_keys.py |
+| `dds_authority` | what signs who may send which DDS topics: dds_security.py |
 | `known_hosts` | what of that `ssh` on this computer accepts; written anew when it differs |
 """
 
@@ -160,6 +161,21 @@ def _former() -> Path:
 def _remove(private: Path) -> None:
     private.unlink()
     _public_file(private).unlink(missing_ok=True)
+
+
+def write_once(file: Path, text: str) -> None:
+    """Make a private file, unless there is one; whole or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    beside = file.with_name(f".{file.name}.{os.getpid()}")
+    beside.unlink(missing_ok=True)
+    with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:
+        stream.write(text)
+    try:
+        os.link(beside, file)
+    except FileExistsError:
+        pass  # another process was first
+    finally:
+        beside.unlink()
 
 
 def _write(file: Path, text: str) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import os
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,20 +39,23 @@ class MessageKeys:
 
     def between(self, sender: Host, receiver: Host) -> str:
         """The key of messages from one computer to another, 64 hexadecimal digits."""
-        words = f"messages from {self._identity(sender)} to {self._identity(receiver)}"
-        return hmac.new(self.secret, words.encode(), hashlib.sha256).hexdigest()
+        return self.derived(f"messages from {self.identity(sender)} to {self.identity(receiver)}").hex()
 
     def time(self, one: Host, other: Host) -> str:
         """The key of NTP messages between two computers, either way: a line of chrony.keys(5), number, type and key."""
         both = sorted([one, other], key=lambda host: host.name)
         names = " ".join(host.name for host in both)
         number = 1 + int.from_bytes(hashlib.sha256(names.encode()).digest()[:4]) % (2**32 - 1)
-        words = f"time between {' and '.join(map(self._identity, both))}"
-        key = hmac.new(self.secret, words.encode(), hashlib.sha256).hexdigest()
-        return f"{number} AES128 HEX:{key[:32].upper()}"
+        key = self.derived(f"time between {' and '.join(map(self.identity, both))}")
+        return f"{number} AES128 HEX:{key[:16].hex().upper()}"
 
-    def _identity(self, host: Host) -> str:
+    def identity(self, host: Host) -> str:
+        """A computer's name, and how often its keys were revoked."""
         return f"{host.name} {self.revocations.get(host.name, 0)}"
+
+    def derived(self, words: str) -> bytes:
+        """A key for what the words say: 32 bytes."""
+        return hmac.new(self.secret, words.encode(), hashlib.sha256).digest()
 
 
 def read() -> MessageKeys:
@@ -63,18 +65,7 @@ def read() -> MessageKeys:
 
 def write_secret(secret: bytes) -> None:
     """Make the file, unless there is one; whole or not at all."""
-    file = secret_file()
-    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    beside = file.with_name(f".{file.name}.{os.getpid()}")
-    beside.unlink(missing_ok=True)
-    with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:
-        stream.write(secret.hex() + "\n")
-    try:
-        os.link(beside, file)
-    except FileExistsError:
-        pass  # another process was first
-    finally:
-        beside.unlink()
+    keys.write_once(secret_file(), secret.hex() + "\n")
 
 
 def _secret() -> bytes:

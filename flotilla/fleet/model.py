@@ -359,6 +359,9 @@ class Network(_Model):
     """UDP ports or ranges that robots accept from fleet addresses. DDS and SSH need no entry."""
     transport: Literal["udp", "dds"] = "udp"
     """Transport of messages between control tasks of several robots: UDP datagrams, or topics of Cyclone DDS."""
+    dds_security: Annotated[bool, Strict()] = False
+    """`true`: control tasks prove by certificates who they are to others by DDS, and believe messages of others only
+    then. They need some seconds more to find each other."""
     update_kbit_s: Annotated[Integer, between(10, 1_000_000, unit="kbit/s")] = 300
     """Rate at which a station sends an update to several robots at once, headers included. The default is 30 % of the
     lowest rate of 802.11b, at which multicast goes: the rest is for control."""

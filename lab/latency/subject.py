@@ -6,12 +6,10 @@ exists here only, and the measurement's own files, which go to `/run`. The shipp
 
 from __future__ import annotations
 
-import base64
 import fnmatch
 import hashlib
 import json
 import stat
-import struct
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,15 +18,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from unittest import mock
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
 from flotilla.common import cache, host, namespace, paths
-from flotilla.fleet import message_keys
 from flotilla.fleet.model import Board, Device, Fleet, Network, Robot
 from images.builder import card, data_partition, filesystem, initramfs, kernel
 from images.builder.build import BoardBuild, board_build
 from images.builder.filesystem import Node
-from lab.latency import compiler, machine
+from lab.latency import compiler, computable_keys, machine
 
 HERE = Path(__file__).parent
 MODULES = ("loop", "squashfs", "overlay", "crc32c_generic", "ext4")
@@ -213,12 +208,8 @@ def identity_nodes(board: Board, keys: Path) -> list[Node]:
     """The measured robot's identity, with keys that are made in the directory `keys`."""
     fleet, measured = robot(board)
     keys.mkdir()
-    for name in (f"{measured.name}_ed25519", "operator_ed25519"):
-        private, public = ssh_key(name)
-        (keys / name).write_text(private)
-        (keys / f"{name}.pub").write_text(public)
     with mock.patch.object(paths, "KEYS", keys):
-        message_keys.write_secret(SECRET)
+        computable_keys.write([f"{measured.name}_ed25519", "operator_ed25519"])
         return data_partition.nodes(fleet, measured)
 
 
@@ -232,27 +223,3 @@ def _data_partition(subject: Subject, image: Path) -> bytes:
         label="data", uuid="5b0e4a3c-6f1d-4c58-9d0a-000000000004", epoch=subject.made.lock.epoch,
     )  # fmt: skip
     return image.read_bytes()
-
-
-SECRET = bytes(32)
-"""A fleet's, which everybody can compute: a run that repeats needs the same one everywhere."""
-
-
-def ssh_key(name: str) -> tuple[str, str]:
-    """A key pair that everybody can compute, in OpenSSH's format: a run that repeats needs the same key everywhere."""
-
-    def text(data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + data
-
-    seed = hashlib.sha256(f"flotilla latency {name}".encode()).digest()
-    public = Ed25519PrivateKey.from_private_bytes(seed).public_key().public_bytes_raw()
-    blob = text(b"ssh-ed25519") + text(public)
-    private = bytes(8) + blob + text(seed + public) + text(name.encode())
-    private += bytes(range(1, 1 + -len(private) % 8))
-    whole = b"openssh-key-v1\0" + text(b"none") * 2 + text(b"") + struct.pack(">I", 1) + text(blob) + text(private)
-    lines = base64.encodebytes(whole).decode().replace("\n", "")
-    body = "\n".join(lines[start : start + 70] for start in range(0, len(lines), 70))
-    return (
-        f"-----BEGIN OPENSSH PRIVATE KEY-----\n{body}\n-----END OPENSSH PRIVATE KEY-----\n",
-        f"ssh-ed25519 {base64.b64encode(blob).decode()} {name}\n",
-    )

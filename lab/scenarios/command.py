@@ -14,7 +14,7 @@ from flotilla.fleet.model import Board
 from images.builder import kernel
 from lab.scenarios import crowd, gate, guests, report, virtual
 from lab.scenarios.flight import Flight
-from lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, standby
+from lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, secured, standby
 from lab.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
@@ -52,7 +52,8 @@ def chosen(given: Sequence[str], there: Iterable[str]) -> Iterable[str]:
 
 
 def _fly(names: list[str], side_m: float, board: Board) -> None:
-    there = {plan.name: plan for plan in (*plans(side_m), *disturbed(side_m), *over_the_air(side_m), *standby(side_m))}
+    every = (plans, disturbed, over_the_air, secured, standby)
+    there = {plan.name: plan for group in every for plan in group(side_m)}
     for name in chosen(names, there):
         if name not in there:
             raise UserError(f"{name}: there is no such flight; there are {', '.join(there)}, and {ALL} for all")

@@ -35,6 +35,8 @@ _FIRST_ALONE = Event(13.5, "lose", ["control-standby"])
 _STANDBY = {"robot2": "control"}
 _DDS_LATER_S = 4
 """Tasks that use DDS take that much longer to start, as long as all share one processor."""
+_SECURED_LATER_S = 34
+"""With certificates as much again: five programs prove who they are to each other, all by one processor."""
 _ANNOUNCED_S = 36
 """By then each DDS program has announced itself to all others once more, as it does every 28 s."""
 STATION_GONE_S = 4
@@ -109,3 +111,10 @@ def _strangers(side_m: float) -> Plan:
     seconds = plan.seconds + STATION_GONE_S
     events = (Event(5, "run", ["date", "--set", "+1 hour"]), Event(plan.seconds, "lose", ["station"]))
     return replace(plan, seconds=seconds, events=events)
+
+
+def secured(side_m: float) -> tuple[Plan, ...]:
+    """By DDS with certificates; apart from the others for its time."""
+    title = "the square, by DDS, with certificates"
+    by_dds = square("dds-secured", title, side_m, transport="dds", dds_security=True)
+    return (replace(by_dds, seconds=by_dds.seconds + _SECURED_LATER_S),)

@@ -21,11 +21,11 @@ import yaml
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity, inventory, message_keys
+from flotilla.fleet import dds_security, identity, inventory, message_keys
 from flotilla.fleet.model import Board, Fleet, Host
 from flotilla.station import telemetry
 from images.builder import runtime
-from lab.latency import machine, results, subject
+from lab.latency import computable_keys, machine, results, subject
 
 HERE = Path(__file__).parent
 INVENTORY = HERE / "inventory"
@@ -90,6 +90,8 @@ class Plan:
     """A computer that is not of the fleet sends to all ports of the control tasks, as often as they step."""
     changes: Mapping[str, object] = field(default_factory=dict)
     """Parameters of control tasks that are not those of their files, by `task.block.parameter`."""
+    dds_security: bool = False
+    """Messages by DDS prove who sent them."""
     air_loss: float | None = None
     """Frames take their time on a channel of 802.11b that all share (air.c), and so many of the attempts get lost, 0
     to 1; None: frames take no time on the air, and none gets lost."""
@@ -111,13 +113,14 @@ def fleet(
     standby: Mapping[str, str] | None = None,
     *,
     second_station: bool = False,
+    dds_security: bool = False,
     board: Board | None = None,
 ) -> Fleet:
     """The published laboratory's, with robots that stand by for others, and a further station; or on another board."""
     described = inventory.load_fleet(INVENTORY)
     if board:
         described = _moved(described, board)
-    network = described.network.model_copy(update={"transport": transport})
+    network = described.network.model_copy(update={"transport": transport, "dds_security": dds_security})
     robots = dict(described.robots)
     for number, robot in described.robots.items():
         if task := (standby or {}).get(robot.name):
@@ -148,7 +151,7 @@ def second(described: Fleet) -> Host:
 def _rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
     """Files of each robot by its name and their path; keys are made in `keys`."""
     with mock.patch.object(paths, "KEYS", keys):
-        message_keys.write_secret(subject.SECRET)
+        computable_keys.write()
         return {
             robot.name: {str(path): content for path, (content, _) in identity.render(fleet, robot).items()}
             for robot in fleet.robots.values()
@@ -204,7 +207,9 @@ def _parsed(task: bytes) -> Any:
 def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """A flight as fly.py reads it, and its files by path."""
     directory = DIRECTORY / plan.name
-    described = fleet(plan.transport, plan.standby, second_station=plan.second_station, board=board)
+    described = fleet(
+        plan.transport, plan.standby, second_station=plan.second_station, dds_security=plan.dds_security, board=board
+    )
     flying = described.robot_with("valves")
     brought = _rendered(described, keys)
     robot_parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
@@ -229,18 +234,19 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
             {"name": name, "computer": SECOND, "file": f"{directory}/{name}.yml"} for name in (SECOND, f"{SECOND}-igps")
         ]
     for robot in described.robots.values():
-        configuration = f"{directory}/{robot.name}-cyclonedds.xml"
-        there[configuration] = brought[robot.name]["/etc/flotilla/cyclonedds.xml"]
         credentials = f"{directory}/{robot.name}"
-        there[f"{credentials}/{message_keys.CREDENTIAL}"] = brought[robot.name][
-            f"/etc/flotilla/{message_keys.CREDENTIAL}"
-        ]
+        configuration = {f"{directory}/{robot.name}-cyclonedds.xml": "cyclonedds.xml"}
+        if plan.dds_security:
+            configuration[f"{credentials}/{dds_security.CREDENTIAL}"] = dds_security.CREDENTIAL
+        private = {f"{credentials}/{message_keys.CREDENTIAL}": message_keys.CREDENTIAL}
+        there |= {path: brought[robot.name][f"/etc/flotilla/{own}"] for path, own in (configuration | private).items()}
+        uri = ",".join(f"file://{path}" for path in configuration)
         for name in robot.control_tasks:
             called = name + STANDBY if name in robot.standby else name
             file = f"{directory}/{called}.yml"
             there[file] = changed(name, brought[robot.name][_path(name)], plan.changes)
             task = {"name": called, "computer": robot.name, "file": file}
-            tasks.append(task | {"cyclonedds": configuration, "credentials": credentials})
+            tasks.append(task | {"cyclonedds": uri, "credentials": credentials})
     events = [asdict(event) for event in plan.events]
     if plan.stranger:
         shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]

@@ -25,7 +25,7 @@ from flotilla.fleet.model import Board, Releases
 from flotilla.robot import release
 from flotilla.updates import delta, multicast
 from images.builder import bundle, card, environment_block, runtime, slot
-from lab.latency import machine, results, subject
+from lab.latency import computable_keys, machine, results, subject
 from lab.latency.virtual_loop import CHAIN, PLUGIN
 
 HERE = Path(__file__).parent
@@ -123,7 +123,7 @@ def update(board: Board, directory: Path) -> Update:
 
 def signer(directory: Path) -> str:
     """A key that everybody can compute signs; its public half. Its private half is the file `key`."""
-    private, public = subject.ssh_key("release")
+    private, public = computable_keys.ssh_key("release")
     (directory / "key").write_text(private)
     (directory / "key").chmod(0o600)
     return public.strip()

@@ -20,6 +20,8 @@ import yaml
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.fleet import identity
+from flotilla.fleet.model import Fleet
 from flotilla.fleet.transport import duration_s
 from flotilla.robot import parameters, scope, ssh
 from lab.emulators.dsp3000 import Dsp3000
@@ -234,6 +236,37 @@ def test_the_task_has_only_the_privileges_it_needs(loop: Loop) -> None:
     others = ["sudo", "systemctl", "show", "-p", properties, "flotilla-task@control.service"]
     shown = loop.robot.shell.run(others).stdout.splitlines()
     assert sorted(shown) == ["AmbientCapabilities=", "CapabilityBoundingSet="], "it drives no I/O ports"
+
+
+def test_dds_proves_who_the_robot_is(loop: Loop, fleet: Fleet) -> None:
+    """With `dds_security`, as provisioning would bring it: the task starts, and a program with its configuration and as
+    its user has the plug-ins. Seen to fail while the credential was missing: the task did not start."""
+    network = fleet.network.model_copy(update={"dds_security": True})
+    files = identity.render(fleet.model_copy(update={"network": network}), loop.robot.robot)
+    names = ("dds-security.xml", "dds-security.conf", "cyclonedds.xml")
+    brought = {str(path): content.decode() for path, (content, _) in files.items() if path.name in names}
+    assert len(brought) == len(names)
+    before = loop.robot.shell.read("/etc/flotilla/cyclonedds.xml").decode()
+    new = [path for path in brought if not path.endswith("cyclonedds.xml")]
+    write = [f"mkdir -p {Path(path).parent}; cat >{path} <<'END'\n{text}END" for path, text in brought.items()]
+    restart = f"systemctl daemon-reload; systemctl reset-failed {UNIT}; systemctl restart {UNIT}"
+    user = f"prlimit --rtprio=99 setpriv --reuid={CONTROL} --regid={CONTROL} --clear-groups"
+    ask = f"""
+    export "$(tr '\\0' '\\n' </proc/$(systemctl show -P MainPID {UNIT})/environ | grep ^CYCLONEDDS_URI=)"
+    {user} ddsperf -i {network.dds_domain} -D 600 sub >/dev/null 2>&1 &
+    while [ -d /proc/$! ] && ! grep libdds_security_crypto /proc/$!/maps; do sleep 0.1; done
+    kill $!
+    """
+    there = ["sudo", "sh", "-e"]
+    try:
+        loop.robot.shell.run(
+            there, stdin="\n".join([*write, "chmod 600 /etc/flotilla/dds-security.xml", restart, ""]), timeout=SECONDS
+        )
+        assert loop.unit("ActiveState") == "active"
+        assert "libdds_security_crypto.so" in loop.robot.shell.run(there, stdin=ask, timeout=SECONDS).stdout
+    finally:
+        back = [f"rm {' '.join(new)}", f"cat >/etc/flotilla/cyclonedds.xml <<'END'\n{before}END", restart, ""]
+        loop.robot.shell.run(there, stdin="\n".join(back), timeout=SECONDS)
 
 
 def attempted(loop: Loop, *user: str) -> set[str]:

@@ -20,6 +20,7 @@ from lab.latency import (
     boottime,
     command,
     compiler,
+    computable_keys,
     controls,
     gate,
     limits,
@@ -546,9 +547,9 @@ def test_modules_load_in_order_of_their_needs() -> None:
 
 
 def test_key_is_one_that_openssh_reads(tmp_path: Path) -> None:
-    private, public = subject.ssh_key("a name")
-    assert subject.ssh_key("a name") == (private, public)
-    assert subject.ssh_key("another")[1] != public
+    private, public = computable_keys.ssh_key("a name")
+    assert computable_keys.ssh_key("a name") == (private, public)
+    assert computable_keys.ssh_key("another")[1] != public
     file = tmp_path / "key"
     file.write_text(private)
     file.chmod(0o600)

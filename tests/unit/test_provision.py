@@ -32,6 +32,7 @@ def test_files_are_those_of_the_card_image() -> None:
         ("/etc/systemd/system/sysinit.target.d/tasks.conf", "control_tasks"),
         ("/etc/systemd/system/flotilla-task@valves.service.d/io-ports.conf", "control_tasks"),
         ("/etc/flotilla/message-keys", "control_tasks"),
+        ("/etc/flotilla/dds-security.xml", "control_tasks"),
         ("/etc/chrony/chrony.keys", "time"),
         ("/etc/hosts.allow", "identity"),
     ],

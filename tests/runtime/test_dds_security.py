@@ -1,0 +1,196 @@
+"""Messages between control tasks by DDS, with what each robot's card has to prove who it is: by the blocks and Cyclone
+DDS's plug-ins, on loopback. Who has no such proof, or another's, is not listened to."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+from flotilla.common import paths
+from flotilla.fleet import dds_security, identity, keys
+from flotilla.fleet.model import Fleet
+from lab.scenarios import virtual
+from tests.running import DDS_ON_LOOPBACK, Task, running
+
+FILE = PurePosixPath("/etc/flotilla") / dds_security.CREDENTIAL
+DOMAIN = 201 + os.getpid() % 30
+"""So that tests at the same time do not hear each other."""
+TOPIC = "wrench"
+GOOD, BAD = [0.25, -0.5, 0.125], [9.0, 9.0, 9.0]
+
+SENDER = """
+period: 10 ms
+priority: 0
+blocks:
+  made: {{type: constant, parameters: {{value: {value}}}}}
+  out: {{type: dds-publish, in: {{wrench: made.out}}, parameters: {parameters}}}
+"""
+RECEIVER = """
+period: 10 ms
+priority: 0
+blocks:
+  in: {{type: dds-subscribe, parameters: {parameters}}}
+"""
+PARAMETERS = f"{{type: wrench, topic: {TOPIC}, robot: 2, domain: {DOMAIN}}}"
+ROS = f"{{type: geometry_msgs/msg/Twist, topic: cmd_vel, domain: {DOMAIN}}}"
+ROS_SENDER = f"""
+period: 10 ms
+priority: 0
+blocks:
+  out: {{type: ros-publish, in: {{linear: [0.25, 0, 0], angular: [0, 0, -0.5]}}, parameters: {ROS}}}
+"""
+ROS_RECEIVER = f"""
+period: 10 ms
+priority: 0
+blocks:
+  in: {{type: ros-subscribe, parameters: {ROS}}}
+"""
+
+Start = Callable[..., AbstractContextManager[Task]]
+
+
+@pytest.fixture(scope="module")
+def fleet() -> Fleet:
+    """The laboratory's, by DDS."""
+    described = virtual.fleet("dds", dds_security=True)
+    network = described.network.model_copy(update={"dds_domain": DOMAIN})
+    return described.model_copy(update={"network": network})
+
+
+def cards(fleet: Fleet, directory: Path) -> dict[str, str]:
+    """What each robot's card has, by the task that it runs; of the fleet whose keys are in the directory."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paths, "KEYS", directory)
+        return {
+            task: identity.render(fleet, robot)[FILE][0].decode()
+            for robot in fleet.robots.values()
+            for task in robot.control_tasks
+        }
+
+
+@pytest.fixture
+def start(flotilla_run: Path, tmp_path: Path) -> Start:
+    blocks = str(flotilla_run.parent)
+
+    def started(name: str, text: str, watched: str, security: str = "") -> AbstractContextManager[Task]:
+        """A task whose DDS writes into `name.log`, with what a card has, or without."""
+        said = f"<Tracing><Verbosity>warning</Verbosity><OutputFile>{tmp_path / f'{name}.log'}</OutputFile></Tracing>"
+        parts = {"common": DDS_ON_LOOPBACK.replace("</Domain>", f"{said}</Domain>"), "security": security}
+        files = [tmp_path / f"{name}-{part}.xml" for part, content in parts.items() if content]
+        for file in files:
+            file.write_text(parts[file.stem.rpartition("-")[2]])
+        uri = ",".join(f"file://{file}" for file in files)
+        argv: list[str | Path] = [flotilla_run, "--blocks", blocks, "--watch", watched]
+        return running(argv, tmp_path / f"{name}.yml", text, {"CYCLONEDDS_URI": uri})
+
+    return started
+
+
+def exchanged(xml: str, other: str, *elements: str) -> str:
+    """A card's file with elements of another one."""
+    for element in elements:
+        pattern = f"(?s)<{element}>.*?</{element}>"
+        (own,), (found,) = re.findall(pattern, xml), re.findall(pattern, other)
+        xml = xml.replace(own, found)
+    return xml
+
+
+@pytest.fixture
+def own(fleet: Fleet, tmp_path: Path) -> dict[str, str]:
+    """What the fleet's cards have."""
+    return cards(fleet, tmp_path / "keys")
+
+
+def no_proof(fleet: Fleet, own: dict[str, str], tmp_path: Path) -> str:
+    return ""
+
+
+def of_another_fleet(fleet: Fleet, own: dict[str, str], tmp_path: Path) -> str:
+    return cards(fleet, tmp_path / "others")["control"]
+
+
+def robot_that_allows_itself(fleet: Fleet, own: dict[str, str], tmp_path: Path) -> str:
+    """Robot 2's identity is the fleet's. It signed itself that it may send what robot 3 may."""
+    tasks = {2: fleet.robots[3].control_tasks, 3: fleet.robots[2].control_tasks}
+    robots = {number: fleet.robots[number].model_copy(update={"control_tasks": tasks[number]}) for number in tasks}
+    others = fleet.model_copy(update={"robots": {**fleet.robots, **robots}})
+    forged = cards(others, tmp_path / "forgery")["control"]
+    return exchanged(own["navigation"], forged, "PermissionsCA", "Governance", "Permissions")
+
+
+def revoked_robot(fleet: Fleet, own: dict[str, str], tmp_path: Path) -> str:
+    """The fleet's cards know so, and its own does not."""
+    former = own["control"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paths, "KEYS", tmp_path / "keys")
+        keys.revoke_host_key(fleet, fleet.robot_with("control"))
+    own.update(cards(fleet, tmp_path / "keys"))
+    return former
+
+
+@pytest.mark.parametrize(
+    ("attacker", "refusal"),
+    [
+        (no_proof, ""),
+        (of_another_fleet, "certificate signature failure"),
+        (robot_that_allows_itself, "permissions from plugin: Failed"),
+        (revoked_robot, "certificate revoked"),
+    ],
+)
+def test_nobody_else_is_listened_to(
+    attacker: Callable[[Fleet, dict[str, str], Path], str],
+    refusal: str,
+    fleet: Fleet,
+    own: dict[str, str],
+    start: Start,
+    tmp_path: Path,
+) -> None:
+    """While the one who may send does, at the same time and as the same robot. Seen to fail with what robot 3 has."""
+    has = attacker(fleet, own, tmp_path)
+    sent, received = SENDER.format(value=GOOD, parameters=PARAMETERS), RECEIVER.format(parameters=PARAMETERS)
+    forged = SENDER.format(value=BAD, parameters=PARAMETERS)
+    with contextlib.ExitStack() as tasks:
+        hearing = tasks.enter_context(start("mapping", received, "in.wrench,in.flag", own["thruster-mapping"]))
+        attacking = tasks.enter_context(start("attacker", forged, "out.written", has))
+        attacking.until(lambda row: row["step"] >= 100)
+        tasks.enter_context(start("control", sent, "out.written", own["control"]))
+        rows = [hearing.until(lambda row: row["flag"])]
+        rows += [row for row, _ in zip(hearing.rows(), range(200), strict=False)]
+    assert {tuple(row["wrench"]) for row in rows if row["flag"]} == {tuple(GOOD)}
+    said = "".join((tmp_path / f"{name}.log").read_text() for name in ("mapping", "attacker"))
+    assert refusal in said
+
+
+def test_nobody_else_listens(start: Start, own: dict[str, str]) -> None:
+    """Neither who has no proof nor a robot whose tasks do not receive it. Seen to fail without security at the
+    sender."""
+    received = RECEIVER.format(parameters=PARAMETERS)
+    with contextlib.ExitStack() as tasks:
+        spies = [
+            tasks.enter_context(start(f"spy-{name}", received, "in.peers,in.flag", security))
+            for name, security in {"stranger": "", "valves": own["valves"]}.items()
+        ]
+        hearing = tasks.enter_context(start("mapping", received, "in.flag", own["thruster-mapping"]))
+        sent = SENDER.format(value=GOOD, parameters=PARAMETERS)
+        tasks.enter_context(start("control", sent, "out.written", own["control"]))
+        hearing.until(lambda row: row["flag"])
+        for spy in spies:
+            seen = spy.until(lambda row: row["step"] >= 200)
+            assert (seen["peers"], seen["flag"]) == (0, 0)
+
+
+@pytest.mark.parametrize("secured", ["sender", "receiver"])
+def test_messages_of_ros_are_for_everybody(start: Start, own: dict[str, str], secured: str) -> None:
+    """A computer that runs ROS has no proof. Seen to fail with governance that allows no such participants."""
+    security = own["control"]
+    with (
+        start("receiver", ROS_RECEIVER, "in.linear,in.flag", security * (secured == "receiver")) as hearing,
+        start("sender", ROS_SENDER, "out.written", security * (secured == "sender")),
+    ):
+        assert hearing.until(lambda row: row["flag"])["linear"] == [0.25, 0, 0]
