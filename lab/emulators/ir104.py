@@ -81,7 +81,7 @@ class Ir104:
         with self.lock:
             return self.lock.wait_for(what, timeout)
 
-    def wait_relays(self, *, on: bool, timeout: float = 20) -> bool:
+    def wait_relays(self, *, on: bool, timeout: float = 60) -> bool:
         """Wait until some relay is on, or all are off."""
         return self.wait(lambda: any(self.relays) == on, timeout)
 

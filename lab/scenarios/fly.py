@@ -101,7 +101,7 @@ def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
         argv += ["--blocks", task["blocks"]]
     environment = dict(os.environ)
     if "cyclonedds" in task:
-        environment["CYCLONEDDS_URI"] = task["cyclonedds"]
+        environment["CYCLONEDDS_URI"] = f"file://{task['cyclonedds']}"
     if "credentials" in task:
         environment["CREDENTIALS_DIRECTORY"] = task["credentials"]
     with (out / "log").open("wb") as log:

@@ -240,13 +240,13 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
             configuration[f"{credentials}/{dds_security.CREDENTIAL}"] = dds_security.CREDENTIAL
         private = {f"{credentials}/{message_keys.CREDENTIAL}": message_keys.CREDENTIAL}
         there |= {path: brought[robot.name][f"/etc/flotilla/{own}"] for path, own in (configuration | private).items()}
-        uri = ",".join(f"file://{path}" for path in configuration)
+        parts = ",file://".join(configuration)  # fly.py puts the first `file://` before it
         for name in robot.control_tasks:
             called = name + STANDBY if name in robot.standby else name
             file = f"{directory}/{called}.yml"
             there[file] = changed(name, brought[robot.name][_path(name)], plan.changes)
             task = {"name": called, "computer": robot.name, "file": file}
-            tasks.append(task | {"cyclonedds": uri, "credentials": credentials})
+            tasks.append(task | {"cyclonedds": parts, "credentials": credentials})
     events = [asdict(event) for event in plan.events]
     if plan.stranger:
         shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]
