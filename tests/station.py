@@ -30,6 +30,9 @@ FLEET = paths.PROJECT / "lab" / "scenarios" / "inventory"
 LOOPBACK = "127.{}.{}.".format(*divmod(256 + os.getpid() % 65024, 256))
 """The fleet's addresses begin so: tests that run beside these have other ones, with the same ports."""
 
+NEIGHBOUR = "127.255.{}.".format(LOOPBACK.split(".")[2])
+"""Of a further fleet of the same test; nobody else's begin so."""
+
 ADDRESS = LOOPBACK + "254"
 """The station's in the fleet on loopback."""
 

@@ -27,7 +27,7 @@ from tests.browser import Browser, Page
 from tests.figures import PROPERTY
 from tests.running import PATIENCE
 from tests.runtime.test_param import Running
-from tests.station import ADDRESS, decoded, on_loopback, secret_in, station
+from tests.station import NEIGHBOUR, decoded, on_loopback, secret_in, station
 from tests.station_page import Station, WheeledRobot, connected, until
 
 WHEELED = Path("lab/wheeled/inventory")
@@ -198,8 +198,10 @@ def test_keys_drive_the_robot(
 def test_the_stick_drives_the_robot(driver: Page, robot: WheeledRobot, artefacts: Path) -> None:
     """And stays where it is when the page says why a robot rests. Seen to fail with the words above the stick."""
     x, y = driver.middle("#stick")
-    driver.value("document.querySelector('#why').textContent = 'The robot rests. '.repeat(10)")
-    assert driver.middle("#stick") == (x, y)
+    place = "document.querySelector('#stick').getBoundingClientRect().y"
+    before = driver.value(place)
+    words = "document.querySelector('#why').textContent = 'The robot rests. '.repeat(10)"
+    assert driver.value(f"{words}, {place}") == before
     driver.mouse("mousePressed", x, y)
     driver.mouse("mouseMoved", x + 10, y - 50)
     until(lambda: robot.motion[0] > 0.1 and robot.motion[1] < 0, "ahead, to the right")
@@ -481,7 +483,7 @@ def test_the_address_and_port_have_to_be_this_computers(fleet: Path, served: Sta
         (("--page-address", "here"), "ADDRESS=here"),
         (("--port", served.host.rpartition(":")[2]), "TCP port"),
     ):
-        other = on_loopback(fleet.parent / f"other{len(options[1])}", begin=ADDRESS.rpartition(".")[0][:-1] + "9.")
+        other = on_loopback(fleet.parent / f"other{len(options[1])}", begin=NEIGHBOUR)
         with station(other, "station", *options, address="127.0.0.1") as process:
             _, complaint = process.communicate(timeout=PATIENCE)
         assert process.returncode == 1
