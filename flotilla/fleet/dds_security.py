@@ -60,17 +60,17 @@ def variables(fleet: Fleet, robot: Robot, shared: MessageKeys) -> dict[str, str]
     return _authority(authority_file(), _authority_text()).variables(fleet, robot, shared)
 
 
-def published(fleet: Fleet, robot: Robot) -> list[str]:
+def _published(fleet: Fleet, robot: Robot) -> list[str]:
     """Messages between control tasks that a robot sends."""
-    return [name for name in protected(fleet) if fleet.messages[name].sender in robot.control_tasks]
+    return [name for name in _protected(fleet) if fleet.messages[name].sender in robot.control_tasks]
 
 
-def subscribed(fleet: Fleet, robot: Robot) -> list[str]:
+def _subscribed(fleet: Fleet, robot: Robot) -> list[str]:
     """Messages between control tasks that a robot receives."""
-    return [name for name in protected(fleet) if fleet.messages[name].receiver in robot.control_tasks]
+    return [name for name in _protected(fleet) if fleet.messages[name].receiver in robot.control_tasks]
 
 
-def protected(fleet: Fleet) -> list[str]:
+def _protected(fleet: Fleet) -> list[str]:
     """All messages between control tasks: DDS topics of these names."""
     return [name for name, message in fleet.messages.items() if message.receiver != STATIONS]
 
@@ -88,7 +88,7 @@ class _Authority:
         derived = int.from_bytes(shared.derived(f"dds key of {shared.identity(robot)}"))
         key = ec.derive_private_key(1 + derived % (_P256_ORDER - 1), ec.SECP256R1())
         identity = self._signed(robot.name, key.public_key(), _serial(shared.identity(robot)))
-        topics = {"publish": published(fleet, robot), "subscribe": subscribed(fleet, robot)}
+        topics = {"publish": _published(fleet, robot), "subscribe": _subscribed(fleet, robot)}
         limits = {"begin": f"{_BEGIN.isoformat()}Z", "end": f"{_END.isoformat()}Z"}
         domain = fleet.network.dds_domain
         return {
@@ -96,7 +96,7 @@ class _Authority:
             "identity": identity.public_bytes(pem).decode(),
             "private_key": key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain).decode(),
             "revoked": self._revoked(shared.revocations),
-            "governance": self._document("dds_governance.xml.j2", domain=domain, topics=protected(fleet)),
+            "governance": self._document("dds_governance.xml.j2", domain=domain, topics=_protected(fleet)),
             "permissions": self._document("dds_permissions.xml.j2", name=robot.name, domain=domain, topics=topics,
                                           **limits),
         }  # fmt: skip

@@ -36,7 +36,7 @@ _STANDBY = {"robot2": "control"}
 _DDS_LATER_S = 4
 """Tasks that use DDS take that much longer to start, as long as all share one processor."""
 _SECURED_LATER_S = 34
-"""With certificates as much again: five programs prove who they are to each other, all by one processor."""
+"""With certificates: five programs prove who they are to each other first, all by one processor."""
 _ANNOUNCED_S = 36
 """By then each DDS program has announced itself to all others once more, as it does every 28 s."""
 STATION_GONE_S = 4

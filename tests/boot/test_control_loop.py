@@ -326,8 +326,8 @@ def test_task_file_is_the_inventorys(loop: Loop, tmp_path: Path) -> None:
 
 def test_dds_proves_who_the_robot_is(loop: Loop, fleet: Fleet) -> None:
     """With `dds_security`, as provisioning would bring it: the task starts, and a program with its configuration and as
-    its user has the plug-ins. The last of the file's tests, for the robot keeps it. Seen to fail while
-    the credential was missing: the task did not start."""
+    its user has the plug-ins. The last of the file's tests, for the robot keeps it. Seen to fail while the credential
+    was missing: the task did not start."""
     network = fleet.network.model_copy(update={"dds_security": True})
     files = identity.render(fleet.model_copy(update={"network": network}), loop.robot.robot)
     names = ("dds-security.xml", "dds-security.conf", "cyclonedds.xml")

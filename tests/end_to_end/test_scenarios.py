@@ -187,8 +187,8 @@ def test_a_link_that_is_cut_on_the_air_ends_in_a_drift(lossy: dict[str, Flight])
 
 @pytest.mark.nightly
 def test_messages_by_dds_with_certificates_fly_the_square(board: Board, session_artefacts: Path) -> None:
-    """All computers are one processor here, which signing and checking fill, so some steps take longer than a period.
-    Seen to fail with the thread that proves on ordinary priority: nobody flew in 46 s."""
+    """All computers are one processor here, which takes most of a period for four hops. Seen to fail with robots that
+    may publish nothing."""
     directories = virtual.fly(secured(TESTED_SIDE_M), board, session_artefacts / "secured")
     for name, directory in directories.items():
         flight = Flight.read(directory)

@@ -17,40 +17,15 @@ from flotilla.fleet import dds_security, identity, keys
 from flotilla.fleet.model import Fleet
 from lab.scenarios import virtual
 from tests.running import DDS_ON_LOOPBACK, Task, running
+from tests.runtime import test_dds
 
 FILE = PurePosixPath("/etc/flotilla") / dds_security.CREDENTIAL
 DOMAIN = 201 + os.getpid() % 30
 """So that tests at the same time do not hear each other."""
-TOPIC = "wrench"
 GOOD, BAD = [0.25, -0.5, 0.125], [9.0, 9.0, 9.0]
-
-SENDER = """
-period: 10 ms
-priority: 0
-blocks:
-  made: {{type: constant, parameters: {{value: {value}}}}}
-  out: {{type: dds-publish, in: {{wrench: made.out}}, parameters: {parameters}}}
-"""
-RECEIVER = """
-period: 10 ms
-priority: 0
-blocks:
-  in: {{type: dds-subscribe, parameters: {parameters}}}
-"""
-PARAMETERS = f"{{type: wrench, topic: {TOPIC}, robot: 2, domain: {DOMAIN}}}"
-ROS = f"{{type: geometry_msgs/msg/Twist, topic: cmd_vel, domain: {DOMAIN}}}"
-ROS_SENDER = f"""
-period: 10 ms
-priority: 0
-blocks:
-  out: {{type: ros-publish, in: {{linear: [0.25, 0, 0], angular: [0, 0, -0.5]}}, parameters: {ROS}}}
-"""
-ROS_RECEIVER = f"""
-period: 10 ms
-priority: 0
-blocks:
-  in: {{type: ros-subscribe, parameters: {ROS}}}
-"""
+"""What test_dds.py's sender publishes, and what an attacker does."""
+PARAMETERS = f"{{type: wrench, topic: wrench, robot: 2, domain: {DOMAIN}}}"
+SENT, RECEIVED = (task.format(parameters=PARAMETERS) for task in (test_dds.SENDER, test_dds.RECEIVER))
 
 Start = Callable[..., AbstractContextManager[Task]]
 
@@ -153,13 +128,13 @@ def test_nobody_else_is_listened_to(
 ) -> None:
     """While the one who may send does, at the same time and as the same robot. Seen to fail with what robot 3 has."""
     has = attacker(fleet, own, tmp_path)
-    sent, received = SENDER.format(value=GOOD, parameters=PARAMETERS), RECEIVER.format(parameters=PARAMETERS)
-    forged = SENDER.format(value=BAD, parameters=PARAMETERS)
+    forged = SENT.replace(str(GOOD), str(BAD))
+    assert forged != SENT
     with contextlib.ExitStack() as tasks:
-        hearing = tasks.enter_context(start("mapping", received, "in.wrench,in.flag", own["thruster-mapping"]))
+        hearing = tasks.enter_context(start("mapping", RECEIVED, "in.wrench,in.flag", own["thruster-mapping"]))
         attacking = tasks.enter_context(start("attacker", forged, "out.written", has))
         attacking.until(lambda row: row["step"] >= 100)
-        tasks.enter_context(start("control", sent, "out.written", own["control"]))
+        tasks.enter_context(start("control", SENT, "out.written", own["control"]))
         rows = [hearing.until(lambda row: row["flag"])]
         rows += [row for row, _ in zip(hearing.rows(), range(200), strict=False)]
     assert {tuple(row["wrench"]) for row in rows if row["flag"]} == {tuple(GOOD)}
@@ -168,17 +143,14 @@ def test_nobody_else_is_listened_to(
 
 
 def test_nobody_else_listens(start: Start, own: dict[str, str]) -> None:
-    """Neither who has no proof nor a robot whose tasks do not receive it. Seen to fail without security at the
-    sender."""
-    received = RECEIVER.format(parameters=PARAMETERS)
+    """Neither who has no proof nor a robot whose tasks do not receive it. Seen to fail with one whose task does."""
     with contextlib.ExitStack() as tasks:
         spies = [
-            tasks.enter_context(start(f"spy-{name}", received, "in.peers,in.flag", security))
+            tasks.enter_context(start(f"spy-{name}", RECEIVED, "in.peers,in.flag", security))
             for name, security in {"stranger": "", "valves": own["valves"]}.items()
         ]
-        hearing = tasks.enter_context(start("mapping", received, "in.flag", own["thruster-mapping"]))
-        sent = SENDER.format(value=GOOD, parameters=PARAMETERS)
-        tasks.enter_context(start("control", sent, "out.written", own["control"]))
+        hearing = tasks.enter_context(start("mapping", RECEIVED, "in.flag", own["thruster-mapping"]))
+        tasks.enter_context(start("control", SENT, "out.written", own["control"]))
         hearing.until(lambda row: row["flag"])
         for spy in spies:
             seen = spy.until(lambda row: row["step"] >= 200)
@@ -189,8 +161,9 @@ def test_nobody_else_listens(start: Start, own: dict[str, str]) -> None:
 def test_messages_of_ros_are_for_everybody(start: Start, own: dict[str, str], secured: str) -> None:
     """A computer that runs ROS has no proof. Seen to fail with governance that allows no such participants."""
     security = own["control"]
+    sent, received = (task.format(domain=DOMAIN) for task in (test_dds.ROS_SENDER, test_dds.ROS_RECEIVER))
     with (
-        start("receiver", ROS_RECEIVER, "in.linear,in.flag", security * (secured == "receiver")) as hearing,
-        start("sender", ROS_SENDER, "out.written", security * (secured == "sender")),
+        start("receiver", received, "in.linear,in.flag", security * (secured == "receiver")) as hearing,
+        start("sender", sent, "out.written", security * (secured == "sender")),
     ):
         assert hearing.until(lambda row: row["flag"])["linear"] == [0.25, 0, 0]
