@@ -13,7 +13,8 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -140,25 +141,40 @@ def card_command_line(emulator: Emulator, board: Board, card: Path, console: Pat
 
 def execute(emulator: Emulator, argv: list[str], directory: Path, timeout_s: float) -> bytes:
     """Run a guest until it reboots; what it wrote to `results` in `directory`, where `console.log` stays, too."""
-    results, console = directory / "results", directory / CONSOLE
-    results.unlink(missing_ok=True)
+    with started(emulator, argv, directory) as process:
+        return ended(process, directory, timeout_s)
+
+
+@contextmanager
+def started(emulator: Emulator, argv: list[str], directory: Path) -> Iterator[subprocess.Popen[str]]:
+    """A guest that runs, at most as long as the body does."""
+    (directory / "results").unlink(missing_ok=True)
     (directory / "qemu.command").write_text(shlex.join(argv) + "\n")
     progress.command(argv)
+    with subprocess.Popen(
+        [*DIE_WITH_PARENT, *argv],
+        env=emulator.environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended(process: subprocess.Popen[str], directory: Path, timeout_s: float) -> bytes:
+    """Wait until a guest reboots; what it wrote to `results` in `directory`."""
+    console = directory / CONSOLE
     try:
-        done = subprocess.run(
-            [*DIE_WITH_PARENT, *argv],
-            env=emulator.environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=timeout_s,
-        )
+        _, said = process.communicate(timeout=timeout_s)
     except subprocess.TimeoutExpired:
         raise UserError(f"the guest did not end within {timeout_s:g} s; {_tail(console)}") from None
-    if done.returncode:
-        raise UserError(f"QEMU ended with status {done.returncode}: {done.stderr.strip()}")
-    content = results.read_bytes()
+    if process.returncode:
+        raise UserError(f"QEMU ended with status {process.returncode}: {said.strip()}")
+    content = (directory / "results").read_bytes()
     if not content:
         raise UserError(f"the guest ended without results; {_tail(console)}")
     return content

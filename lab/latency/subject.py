@@ -11,7 +11,7 @@ import hashlib
 import json
 import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path, PurePosixPath
@@ -124,10 +124,13 @@ def units(board: Board, directory: PurePosixPath, *, modules: bool = True) -> di
     return files
 
 
-def write_initrd(subject: Subject, out: Path, plan: dict[str, Any], more: Mapping[str, bytes]) -> str:
+def write_initrd(
+    subject: Subject, out: Path, plan: dict[str, Any], more: Mapping[str, bytes], nodes: Sequence[Node] | None = None
+) -> str:
     """Write the archive that QEMU loads beside the kernel; SHA-256 of all in it but the root.
 
-    `plan`: what `measure.py` reads. `more`: further files, by their path.
+    `plan`: what `measure.py` reads. `more`: further files, by their path. `nodes`: of a data partition that is not the
+    measured robot's.
     """
     absolute = {str(DIRECTORY / name): file for name, file in measurement(subject.board, plan).items()}
     absolute |= {path: (0o644, content) for path, content in more.items()}
@@ -141,7 +144,7 @@ def write_initrd(subject: Subject, out: Path, plan: dict[str, Any], more: Mappin
     with tempfile.TemporaryDirectory(dir=out.parent) as temporary:
         directory = Path(temporary)
         files |= _from_root(subject, directory / "root")
-        files["data.ext4"] = (0o644, _data_partition(subject, directory / "data"))
+        files["data.ext4"] = (0o644, _data_partition(subject, directory / "data", nodes))
     directories = {"dev", "proc", "sys", "root"}
     for name in [*files, *_LINKS]:
         directories |= {str(parent) for parent in PurePosixPath(name).parents} - {"."}
@@ -213,8 +216,8 @@ def identity_nodes(board: Board, keys: Path) -> list[Node]:
         return data_partition.nodes(fleet, measured)
 
 
-def _data_partition(subject: Subject, image: Path) -> bytes:
-    nodes = identity_nodes(subject.board, image.with_name("keys"))
+def _data_partition(subject: Subject, image: Path, given: Sequence[Node] | None) -> bytes:
+    nodes = list(given) if given else identity_nodes(subject.board, image.with_name("keys"))
     # The card is in memory: it neither grows nor needs to.
     nodes += [Node(PurePosixPath(path)) for path in ("/var/lib", "/var/lib/flotilla")]
     nodes.append(Node(PurePosixPath("/var/lib/flotilla/grown"), b"", 0o644))

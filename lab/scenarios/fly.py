@@ -33,7 +33,7 @@ def run(*argv: str) -> None:
 
 
 class Air:
-    """The process that carries frames between the radios, each for its air time: air.c, loaded by a Python of its own.
+    """The process that carries frames between the radios, each for its air time: lab/air, in a Python of its own.
 
     Above all else: it is no computer's.
     """

@@ -22,9 +22,10 @@ import yaml
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import dds_security, identity, inventory, message_keys
-from flotilla.fleet.model import Board, Fleet, Host
+from flotilla.fleet.model import Board, Fleet, Host, Robot
 from flotilla.station import telemetry
 from images.builder import runtime
+from lab import air
 from lab.latency import computable_keys, machine, results, subject
 
 HERE = Path(__file__).parent
@@ -93,7 +94,7 @@ class Plan:
     dds_security: bool = False
     """Messages by DDS prove who sent them."""
     air_loss: float | None = None
-    """Frames take their time on a channel of 802.11b that all share (air.c), and so many of the attempts get lost, 0
+    """Frames take their time on a channel of 802.11b that all share (lab/air), and so many of the attempts get lost, 0
     to 1; None: frames take no time on the air, and none gets lost."""
 
     @property
@@ -184,6 +185,12 @@ def station(described: Fleet) -> bytes:
     return _own("station.yml.j2", controllers=described.robots_with("control"), **streams)
 
 
+def plant(parameters: Mapping[str, object], described: Fleet, board: Board, flying: Robot) -> bytes:
+    """The task of the robot that flies, and of what measures it."""
+    gyro = gyro_device(described, board)
+    return _own("plant.yml.j2", parameters=parameters, robot_address=flying.address, gyro=gyro)
+
+
 def _receivers(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> list[str]:
     """Where control tasks receive datagrams, and of what length: `address:port:length`."""
     return [
@@ -214,12 +221,7 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
     brought = _rendered(described, keys)
     robot_parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
     there = {
-        f"{directory}/plant.yml": _own(
-            "plant.yml.j2",
-            parameters=robot_parameters,
-            robot_address=flying.address,
-            gyro=gyro_device(described, board),
-        ),
+        f"{directory}/plant.yml": plant(robot_parameters, described, board, flying),
         f"{directory}/station.yml": station(described),
     }
     tasks = [
@@ -268,7 +270,7 @@ def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
     there = {
         f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
         f"{DIRECTORY}/stranger.py": (HERE / "stranger.py").read_bytes(),
-        AIR: runtime.compile_plugin(HERE / "air.c", board.architecture),
+        AIR: air.compiled(air.ONE_GUEST, board.architecture),
     }
     flights = []
     for plan in plans:

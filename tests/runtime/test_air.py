@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flotilla.common import paths
+from lab.air import HERE, ONE_GUEST
 from lab.radio.phy import ACK_BYTES, DSSS_BIT_S, B, G
 
 RATES_MBIT_S = (1, 2, 5.5, 11, 6, 9, 12, 18, 24, 36, 48, 54)
@@ -22,9 +22,9 @@ RATES_MBIT_S = (1, 2, 5.5, 11, 6, 9, 12, 18, 24, 36, 48, 54)
 @pytest.fixture(scope="module")
 def air(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     library = tmp_path_factory.mktemp("air") / "air.so"
-    source = paths.PROJECT / "lab/scenarios/air.c"
+    sources = [HERE / name for name in ONE_GUEST]
     options = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "-fvisibility=hidden"]
-    subprocess.run(["cc", *options, "-o", library, source], check=True)
+    subprocess.run(["cc", *options, "-o", library, *sources], check=True)
     loaded = ctypes.CDLL(str(library))
     loaded.air_ns.restype = ctypes.c_int64
     return loaded
