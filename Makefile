@@ -312,8 +312,8 @@ latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control
 boot-time: | setup-tests ## where a boot spends its time, in virtual time
 	$(Q)$(FLOTILLA) boot-time $(measured)
 
-scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ROBOTS=16]
-	$(Q)$(FLOTILLA) scenarios $(if $(filter guests,$(ON)),--guests) $(call option,--link,LINK) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
+scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ON=lockstep | ROBOTS=16]
+	$(Q)$(FLOTILLA) scenarios $(addprefix --,$(filter guests lockstep,$(ON))) $(call option,--link,LINK) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
 
 scenarios-accept: | setup-tests ## make a new run the accepted one: commit lab/scenarios/baseline.json
 	$(Q)$(FLOTILLA) scenarios-accept

@@ -12,13 +12,14 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board
 from images.builder import kernel
-from lab.scenarios import crowd, gate, guests, report, virtual
+from lab.scenarios import crowd, gate, guests, lockstep, report, virtual
 from lab.scenarios.flight import Flight
 from lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, secured, standby
 from lab.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
 GUESTS = paths.BUILD / "flights"
+LOCKSTEP = paths.BUILD / "lockstep"
 ALL = "all"
 DEFAULT = "udp"
 """The flight of who names none: a few minutes."""
@@ -80,6 +81,18 @@ def _fly_guests(names: list[str], side_m: float, board: Board, link: str) -> Non
     print(f"{paths.shown(page)}; consoles of the guests: {paths.shown(GUESTS)}")
 
 
+def _fly_lockstep(names: list[str], side_m: float, board: Board) -> None:
+    there = {plan.name: plan for plan in (*plans(side_m), *over_the_air(side_m)) if plan.air_loss is not None}
+    names = names or [lockstep.DEFAULT]
+    if others := [name for name in chosen(names, there) if name not in there]:
+        raise UserError(f"{', '.join(others)}: guests in lock-step fly {', '.join(there)}, over the air")
+    to_fly = [there[name] for name in chosen(names, there)]
+    shutil.rmtree(LOCKSTEP, ignore_errors=True)
+    flown = {plan.title: lockstep.fly(plan, board, LOCKSTEP / plan.name) for plan in to_fly}
+    page = report.write(flown, paths.BUILD / "reports", "lockstep", lockstep.HOW)
+    print(f"{paths.shown(page)}; consoles of the guests: {paths.shown(LOCKSTEP)}")
+
+
 def crowds(most: int, board: Board) -> None:
     """Measure these many robots and fewer."""
     sizes = [size for size in crowd.SIZES if size <= most]
@@ -114,6 +127,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help=f"of the square (%(default)s m; as published, {SIDE_M:g})",
     )
     parser.add_argument("--guests", action="store_true", help="in real time, by guests of the card images")
+    parser.add_argument("--lockstep", action="store_true", help="in virtual time, a guest for each computer")
     parser.add_argument(
         "--link",
         choices=tuple(guests.HOW),
@@ -131,7 +145,9 @@ def run(arguments: argparse.Namespace) -> None:
         crowds(arguments.robots, _board(arguments.board))
     else:
         board = _board(arguments.board)
-        if arguments.guests:
+        if arguments.lockstep:
+            _fly_lockstep(arguments.flights, arguments.side, board)
+        elif arguments.guests:
             _fly_guests(arguments.flights, arguments.side, board, arguments.link)
         else:
             _fly(arguments.flights, arguments.side, board)

@@ -1,0 +1,244 @@
+"""Flights in virtual time by a fleet: each of its computers is a guest that boots the shipped system, all by one clock.
+
+Each guest has a processor of its own, the robot's identity as its card has it, and a simulated radio; the image's
+services join the cell and run the control tasks. Guests wait for each other at the end of each quantum, and what their
+radios send is carried by one channel (lab/air). The station and the robot that flies are a namespace of the flying
+robot's guest. A run repeats to the byte.
+"""
+
+from __future__ import annotations
+
+import base64
+import ctypes
+import errno
+import json
+import os
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import yaml
+
+from flotilla.common import paths, progress
+from flotilla.common.errors import UserError
+from flotilla.fleet import identity
+from flotilla.fleet.model import Board, Fleet, Robot
+from images.builder import data_partition, runtime
+from images.builder.filesystem import Node
+from lab import air
+from lab.latency import computable_keys, machine, results, subject
+from lab.qemu import qemu
+from lab.scenarios import guests as realtime
+from lab.scenarios import virtual
+from lab.scenarios.flight import Flight
+from lab.scenarios.virtual import DIRECTORY, PLANT, RATE_MBIT_S, RELAYS, STATION, Plan
+
+HERE = Path(__file__).parent
+DEFAULT = "air"
+HOW = (
+    "Each is a guest with a processor of its own, in virtual time; all have one clock, and simulated radios on one "
+    "channel of 802.11b. The robot's own clock measures latencies."
+)
+_MEMBER = f"{DIRECTORY}/member.so"
+_BEFORE_S = 300.0
+"""Of virtual time, at most, before a flight begins: guests boot, and join the cell."""
+_RESULTS_LIMIT_S = 900
+"""Of the host's clock, for a guest to send its results: finite, and generous to a busy host."""
+_TOLD_BYTES = 1000
+
+
+@dataclass(frozen=True)
+class Member:
+    """One guest."""
+
+    robot: Robot
+    radios: tuple[int, ...]
+    """Numbers on the channel."""
+    files: Mapping[str, bytes]
+    nodes: Sequence[Node]
+    """Of its data partition."""
+
+
+def described(plan: Plan, board: Board) -> Fleet:
+    return realtime.fleet(plan.transport, board, "ibss")
+
+
+def members(plan: Plan, board: Board, keys: Path) -> list[Member]:
+    """The flying robot's guest first, which has the station's radio, too."""
+    fleet = described(plan, board)
+    flying = fleet.robot_with("valves")
+    robots = sorted(fleet.robots.values(), key=lambda robot: robot != flying)
+    library = air.compiled(air.MEMBER, board.architecture)
+    programs = ("fly.py", "member.py")
+    common = {f"{DIRECTORY}/lab/scenarios/{name}": (HERE / name).read_bytes() for name in programs} | {_MEMBER: library}
+    found, radios = [], 0
+    with mock.patch.object(paths, "KEYS", keys):
+        computable_keys.write([*(f"{robot.name}_ed25519" for robot in robots), "operator_ed25519"])
+        for robot in robots:
+            count = 2 if robot is flying else 1
+            session = _session(plan, fleet, board, robot, (radios, count))
+            files = common | {f"{DIRECTORY}/session.json": json.dumps(session, sort_keys=True).encode()}
+            if robot is flying:
+                files |= _of_the_station(plan, fleet, board, flying)
+            nodes = [_changed(node, plan) for node in data_partition.nodes(fleet, robot)]
+            found.append(Member(robot, tuple(range(radios, radios + count)), files, nodes))
+            radios += count
+    return found
+
+
+def _bell(board: Board) -> str:
+    """The connector by which a guest learns that it has mail: the last one but that of the results."""
+    return list(qemu.port_ids(board))[-2]
+
+
+def _session(plan: Plan, fleet: Fleet, board: Board, robot: Robot, radios: tuple[int, int]) -> dict[str, Any]:
+    """As member.py reads it."""
+    flying = fleet.robot_with("valves")
+    (station,) = fleet.stations
+    session: dict[str, Any] = {
+        "name": robot.name, "library": _MEMBER, "radios": radios, "mbit_s": RATE_MBIT_S, "seconds": plan.seconds,
+        "flight": None, "tasks": robot.control_tasks, "bell": f"/dev/{board.ports[_bell(board)].tty}",
+    }  # fmt: skip
+    if robot is flying:
+        others = [other for other in fleet.robots.values() if other is not flying]
+        tasks = [
+            {"name": "station", "computer": STATION, "file": f"{DIRECTORY}/station.yml"},
+            {"name": "plant", "computer": STATION, "file": f"{DIRECTORY}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
+        ]
+        events = [asdict(event) for event in plan.events]
+        length = fleet.network.subnet.prefixlen
+        session |= {
+            "station": {"name": STATION, "address": f"{station.address}/{length}"},
+            "peers": [str(host.address) for host in (*others, station)],
+            "flight": {"name": plan.name, "seconds": plan.seconds, "tasks": tasks, "events": events},
+        }
+    return session
+
+
+def _of_the_station(plan: Plan, fleet: Fleet, board: Board, flying: Robot) -> dict[str, bytes]:
+    parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
+    return {
+        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
+        f"{DIRECTORY}/station.yml": virtual.station(fleet),
+        f"{DIRECTORY}/plant.yml": virtual.plant(parameters, fleet, board, flying),
+    }
+
+
+def _changed(node: Node, plan: Plan) -> Node:
+    """A file of a data partition; a control task with what the plan changes."""
+    if node.content is None or node.path.parent.name != identity.TASKS.name:
+        return node
+    return replace(node, content=virtual.changed(node.path.stem, node.content, plan.changes))
+
+
+def fly(plan: Plan, board: Board, out: Path) -> Flight:
+    """Fly it, in the directory `out`."""
+    board = described(plan, board).boards[board.name]
+    (out / "keys").mkdir(parents=True, exist_ok=True)
+    system = subject.build(board)
+    emulator = machine.emulator()
+    for name, sources in {"barrier.so": air.BARRIER, "conductor.so": air.CONDUCTOR}.items():
+        (out / name).write_bytes(air.compiled(sources, "amd64"))
+    fleet = members(plan, board, out / "keys")
+    console = out / fleet[0].robot.name / machine.CONSOLE
+    title = f"{plan.name}: {len(fleet)} guests in lock-step"
+    with ExitStack() as stack:
+        guests = [stack.enter_context(_running(member, board, system, emulator, out)) for member in fleet]
+        seconds = {plan.name: plan.seconds}
+        stack.enter_context(progress.step(title, lambda: virtual.far(progress.text(console), seconds)))
+        with ThreadPoolExecutor(len(guests)) as pool:
+            told = pool.submit(_conduct, plan, fleet, guests, out).result()
+            directories = [out / member.robot.name for member in fleet]
+            contents = list(pool.map(partial(machine.ended, timeout_s=_RESULTS_LIMIT_S), guests, directories))
+    flight = out / "flight"
+    flight.mkdir(exist_ok=True)
+    (flight / "air.json").write_text(told)
+    answers = {member.robot.name: _answer(content) for member, content in zip(fleet, contents, strict=True)}
+    for name, encoded in [item for answer in answers.values() for item in answer["files"].items()]:
+        file = flight / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(base64.b64decode(encoded))
+    if errors := [f"{name}: {answer['error'].strip()}" for name, answer in answers.items() if "error" in answer]:
+        raise UserError("the flight failed in a guest:\n" + "\n".join(errors))
+    return replace(Flight.read(flight), one_clock=False)
+
+
+@contextmanager
+def _running(
+    member: Member, board: Board, system: subject.Subject, emulator: machine.Emulator, out: Path
+) -> Iterator[subprocess.Popen[str]]:
+    """A guest that runs, at most as long as the body does."""
+    directory = out / member.robot.name
+    directory.mkdir(exist_ok=True)
+    box, initrd = directory / "mailbox", directory / "initrd.img"
+    box.write_bytes(bytes(air.MAILBOX_BYTES))
+    commands = {"session": ["env", "-C", str(DIRECTORY), "python3", "-m", "lab.scenarios.member", "session.json"]}
+    nodes = sorted(member.nodes, key=lambda node: node.path.parts)
+    subject.write_initrd(system, initrd, {"scenarios": [], "commands": commands}, member.files, nodes)
+    extra = _shared_memory(box, out / "barrier.so", qemu.port_ids(board)[_bell(board)])
+    if len(member.radios) > 1:
+        extra += RELAYS
+    guest = machine.Machine(emulator, board, system.kernel, initrd, system.arguments(), extra=extra)
+    argv = guest.command_line(directory / machine.CONSOLE, directory / "results")
+    try:
+        with machine.started(emulator, argv, directory) as process:
+            yield process
+    finally:
+        initrd.unlink()
+
+
+def _shared_memory(box: Path, barrier: Path, bell: str) -> tuple[str, ...]:
+    """QEMU's arguments for a guest that shares its mailbox, and waits for others."""
+    memory = f"memory-backend-file,id=mailbox,share=on,mem-path={box},size={air.MAILBOX_BYTES}"
+    return (
+        "-object",
+        memory,
+        "-device",
+        "ivshmem-plain,memdev=mailbox",
+        "-plugin",
+        f"{barrier},mailbox={box},bell={bell}",
+    )
+
+
+def _answer(content: bytes) -> dict[str, Any]:
+    """Of member.py, in what a guest sent."""
+    answer: dict[str, Any] = json.loads(results.received(content)["commands"]["session"])
+    return answer
+
+
+def _conduct(plan: Plan, fleet: Sequence[Member], guests: Sequence[subprocess.Popen[str]], out: Path) -> str:
+    """Until one of the guests wishes to end; what the channel did, as JSON."""
+    conductor = ctypes.CDLL(str(out / "conductor.so"))
+    alive = ctypes.CFUNCTYPE(ctypes.c_bool)(lambda: all(guest.poll() is None for guest in guests))
+    boxes = [bytes(out / member.robot.name / "mailbox") for member in fleet]
+    guest_of = [number for number, member in enumerate(fleet) for _ in member.radios]
+    told = ctypes.create_string_buffer(_TOLD_BYTES)
+    status = conductor.conduct(
+        len(boxes), (ctypes.c_char_p * len(boxes))(*boxes), len(guest_of), (ctypes.c_int * len(guest_of))(*guest_of),
+        ctypes.c_double(plan.air_loss or 0), ctypes.c_int64(round((_BEFORE_S + plan.seconds) * 1e9)), alive, told,
+        _TOLD_BYTES,
+    )  # fmt: skip
+    if status == errno.ETIMEDOUT:
+        gone = [member.robot.name for member, guest in zip(fleet, guests, strict=True) if guest.poll() is not None]
+        raise UserError("\n".join(_why(out / name) for name in gone))
+    if status == errno.ETIME:
+        raise UserError(
+            f"{plan.name}: no guest had flown it {_BEFORE_S + plan.seconds:g} virtual seconds after power on"
+        )
+    if status:
+        raise UserError(f"guests in lock-step: {os.strerror(status)}")
+    return told.value.decode()
+
+
+def _why(directory: Path) -> str:
+    """What a guest that ended too early has to say."""
+    content = (directory / "results").read_bytes()
+    if content:
+        return f"{directory.name}: {_answer(content).get('error', 'ended before the others').strip()}"
+    return f"{directory.name} ended; its console: {paths.shown(directory / machine.CONSOLE)}"
