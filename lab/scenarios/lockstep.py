@@ -225,8 +225,8 @@ def _conduct(plan: Plan, fleet: Sequence[Member], guests: Sequence[subprocess.Po
         _TOLD_BYTES,
     )  # fmt: skip
     if status == errno.ETIMEDOUT:
-        gone = [member.robot.name for member, guest in zip(fleet, guests, strict=True) if guest.poll() is not None]
-        raise UserError("\n".join(_why(out / name) for name in gone))
+        gone = [(member, guest) for member, guest in zip(fleet, guests, strict=True) if guest.poll() is not None]
+        raise UserError("\n".join(_why(guest, out / member.robot.name) for member, guest in gone))
     if status == errno.ETIME:
         raise UserError(
             f"{plan.name}: no guest had flown it {_BEFORE_S + plan.seconds:g} virtual seconds after power on"
@@ -236,9 +236,7 @@ def _conduct(plan: Plan, fleet: Sequence[Member], guests: Sequence[subprocess.Po
     return told.value.decode()
 
 
-def _why(directory: Path) -> str:
-    """What a guest that ended too early has to say."""
-    content = (directory / "results").read_bytes()
-    if content:
-        return f"{directory.name}: {_answer(content).get('error', 'ended before the others').strip()}"
-    return f"{directory.name} ended; its console: {paths.shown(directory / machine.CONSOLE)}"
+def _why(guest: subprocess.Popen[str], directory: Path) -> str:
+    """What a guest that ended too early has to say; UserError where QEMU does."""
+    answer = _answer(machine.ended(guest, directory, timeout_s=1))
+    return f"{directory.name}: {answer.get('error', 'ended before the others').strip()}"

@@ -15,13 +15,15 @@ from flotilla.fleet.model import Board
 from lab.scenarios import lockstep, virtual
 from lab.scenarios.flight import Flight
 from lab.scenarios.plans import TESTED_SIDE_M, over_the_air, plans
-from tests.end_to_end.test_scenarios import ends_in_a_drift, square_is_flown, steps_are_flown, valves_were_open
+from tests.end_to_end.test_scenarios import TIMEOUT_NS, square_is_flown, steps_are_flown, valves_were_open
 from tests.perturb import perturbed_host
 
 pytestmark = pytest.mark.nightly  # four boots each; tests/runtime/test_lockstep.py holds the order of events each time
 
 FLOWN = ("air", "air-1", "air-5", "air-10")
 CUT = "air-cut-open"
+CHECKED_S, REJOINED_S = 5, 1
+"""How often `flotilla-cell@` looks where the adapter is, and what it takes until commands come again."""
 LOST = {"air": 0.0}
 """By flight, the share of steps that may be lost; of the others, as in flights of one guest."""
 
@@ -48,14 +50,29 @@ def test_the_flight(flown: tuple[str, Flight, Path]) -> None:
     name, flight, out = flown
     print(f"{name}: {(out / 'flight/air.json').read_text()}")
     if name == CUT:
-        ends_in_a_drift(name, flight)
-        valves_were_open(flight)
+        drifts_until_it_is_back(flight)
         return
     square_is_flown(name, flight)
     steps_are_flown(name, flight, lost=LOST.get(name, 0.002))
     carried = json.loads((out / "flight/air.json").read_text())
     assert carried["frames"] > 4 * len(flight.arrived)
     assert (carried["lost"] > 0) == (name != "air")
+
+
+def drifts_until_it_is_back(flight: Flight) -> None:
+    """The robot leaves the cell, and its own service has it join again: valves are closed meanwhile."""
+    valves_were_open(flight)
+    (cut_ns,) = flight.events_ns
+    closed = flight.since(cut_ns + TIMEOUT_NS)
+    opened = [sum(record["on_time"]) for record in closed]
+    gone = [record for record, on_time in zip(closed, opened, strict=True) if on_time == opened[0]]
+    seconds = (gone[-1]["time_ns"] - cut_ns) / 1e9
+    rates = {record["velocity"][2] for record in gone}
+    print(f"{CUT}: without commands for {seconds:.2f} s, at {sorted(rates)} rad/s")
+    assert 1 < seconds < CHECKED_S + REJOINED_S
+    assert len(rates) == 1
+    assert opened[-1] > opened[0], "control did not go on"
+    assert abs(flight.flown[-1]["velocity"][2]) < abs(rates.pop())
 
 
 def test_it_repeats_to_the_byte(board: Board, artefacts: Path) -> None:
