@@ -98,6 +98,7 @@ ELSEWHERE = {
         "need an adapter; tests/boot/shared/test_radio.py has a simulated one",
     ),
     'make scenarios FLIGHTS="air air-10"': "test_scenarios.py flies them",
+    'make scenarios ON=lockstep FLIGHTS="air air-10"': "test_scenarios_lockstep.py flies them, nightly",
     "make lock": "asks the mirror for other packages; unit/test_lock.py",
     "make param ROBOT=1 TASK=heading": "needs the robot; test_control_loop.py asks a guest",
     "make param ROBOT=1 TASK=heading PARAM=attitude.kp VALUE=2.5": "needs the robot; test_control_loop.py asks a guest",
