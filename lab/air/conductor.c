@@ -134,10 +134,9 @@ static int quanta(int64_t longest_ns, bool (*alive)(void))
 }
 
 /* Guests with mailboxes in these files are in lock-step, until one wishes to end. Radio N is guest `guest_of[N]`'s.
- * `alive`: asked each second in which a guest is waited for. `told`: what the channel
- * did, as JSON. Returns 0, or a number of errno.h: ETIMEDOUT where a guest has ended, ETIME where nobody
- * wished to end by `longest_ns`, ENOBUFS where a mailbox had no room, EINVAL where there are too many guests or radios.
- */
+ * `alive`: asked each second in which a guest is waited for. `told`: what the channel did, as JSON. Returns 0, or a
+ * number of errno.h: ETIMEDOUT where a guest has ended, ETIME where nobody wished to end by `longest_ns`, ENOBUFS where
+ * a mailbox had no room, EINVAL where there are too many guests or radios. */
 EXPORT int conduct(int guests, const char *const files[], int radios, const int guest_of[], double loss,
                    int64_t longest_ns, bool (*alive)(void), char *told, int size);
 
@@ -147,16 +146,19 @@ int conduct(int guests, const char *const files[], int radios, const int guest_o
     if (guests < 1 || guests > GUESTS ||
         !channel_open(radios, loss, (struct fates){.deliver = deliver, .report = report}))
         return EINVAL;
-    all.guests = guests;
     memcpy(all.guest_of, guest_of, (size_t)radios * sizeof *guest_of);
-    for (int i = 0; i < guests; i++) {
-        int file = open(files[i], O_RDWR | O_CLOEXEC);
-        all.boxes[i] = mmap(NULL, MAILBOX_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+    int status = 0;
+    for (all.guests = 0; all.guests < guests && !status; all.guests += !status) {
+        int file = open(files[all.guests], O_RDWR | O_CLOEXEC);
+        void *shared = mmap(NULL, MAILBOX_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+        status = shared == MAP_FAILED ? errno : 0;
+        all.boxes[all.guests] = shared;
         close(file);
-        if (all.boxes[i] == MAP_FAILED)
-            return errno;
     }
-    int status = quanta(longest_ns, alive);
+    if (!status)
+        status = quanta(longest_ns, alive);
+    while (all.guests)
+        munmap(all.boxes[--all.guests], MAILBOX_BYTES);
     tell(told, size);
     return status;
 }
