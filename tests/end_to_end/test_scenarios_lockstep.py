@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from flotilla.fleet.model import Board
-from lab.scenarios import lockstep, virtual
+from lab.scenarios import lockstep, report, virtual
 from lab.scenarios.flight import Flight
 from lab.scenarios.plans import TESTED_SIDE_M, over_the_air, plans
 from tests.end_to_end.test_scenarios import TIMEOUT_NS, square_is_flown, steps_are_flown, valves_were_open
@@ -48,6 +48,7 @@ def test_the_flight(flown: tuple[str, Flight, Path]) -> None:
     Seen to fail with guests that learn of their mail 4 ms late: half of the steps took longer than a period.
     """
     name, flight, out = flown
+    assert f"<h2>{name}</h2>" in report.write({name: flight}, out, how=lockstep.HOW).read_text()
     print(f"{name}: {(out / 'flight/air.json').read_text()}")
     if name == CUT:
         drifts_until_it_is_back(flight)

@@ -66,6 +66,16 @@ def test_clocks_of_several_computers_are_not_compared() -> None:
     assert found.faults(disturbed=False) == []
 
 
+def test_tasks_that_measure_no_jitter_have_overruns_all_the_same() -> None:
+    """As those of guests in lock-step. Seen to fail: such a flight had no page."""
+    found = flight(2000)
+    found.statistics = {"plant": {"overruns": 1, "jitter": {"max_ns": 7000}}}
+    assert report.summary(found)["jitter_max_us"] == 7
+    found.statistics["valves"] = {"overruns": 2}
+    assert report.summary(found)["overruns"] == 3
+    assert "jitter_max_us" not in report.summary(found)
+
+
 def test_the_page_marks_what_is_late_and_what_cannot_be(tmp_path: Path) -> None:
     def marks(found: Flight) -> int:
         return report.write({"square": found}, tmp_path).read_text().count('class="missed"')
