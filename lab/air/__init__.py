@@ -18,7 +18,6 @@ BARRIER = ("barrier.c",)
 """Of QEMU."""
 MAILBOX_BYTES = 1 << 20
 """As lockstep.h has it."""
-QUANTUM_S = 0.00025
 
 
 def compiled(sources: tuple[str, ...], architecture: str) -> bytes:

@@ -77,10 +77,9 @@ int64_t air_ns(int bytes, unsigned rate)
     return (20 + 4LL * ((16 + 8 * bytes + 6 + bits - 1) / bits) + 6) * 1000;
 }
 
-/* Radio N has the address ..:..:..:NN:NN:.. of the interface or of the driver. */
 int channel_radio(const uint8_t *address)
 {
-    int number = address[3] << 8 | address[4];
+    int number = radio_number(address);
     return number < air.radio_count ? number : -1;
 }
 

@@ -39,6 +39,12 @@ struct fates {
 /* A new channel of the radios 0 to `radios` - 1; 0 to 1 of the attempts get lost. False: so many radios cannot be. */
 bool channel_open(int radios, double loss, struct fates fates);
 
+/* Radio N has the address ..:..:..:NN:NN:.. of the interface or of the driver. */
+static inline int radio_number(const uint8_t address[ADDRESS])
+{
+    return address[3] << 8 | address[4];
+}
+
 /* The radio of an address; -1: none of the channel's. */
 int channel_radio(const uint8_t *address);
 

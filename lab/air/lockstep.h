@@ -12,7 +12,8 @@
 
 enum { MAILBOX_BYTES = 1 << 20, MESSAGES = 128 };
 
-/* What a quantum takes: no frame with its acknowledgement ends sooner after it began. */
+/* What a quantum takes: no frame at 11 Mbit/s and below ends sooner after it began, with its
+ * acknowledgement. */
 #define QUANTUM_NS 500000LL
 /* Until all guests have radios. */
 #define LONG_QUANTUM_NS 10000000LL
@@ -34,12 +35,11 @@ struct messages {
 };
 
 struct mailbox {
-    _Atomic uint32_t waits; /* 1: the guest does, and all of this is the conductor's */
-    uint32_t joined;        /* the guest has radios */
-    uint32_t leaves;        /* the guest wishes that all end */
-    uint32_t ended;         /* all do */
-    uint32_t full;          /* messages for which there was no room */
-    uint32_t unused;
+    _Atomic uint32_t waits;      /* 1: the guest does, and all of this is the conductor's */
+    uint32_t joined;             /* the guest has radios */
+    uint32_t leaves;             /* the guest wishes that all end */
+    uint32_t ended;              /* all do */
+    uint32_t full;               /* messages for which there was no room */
     _Alignas(8) int64_t next_ns; /* end of the quantum that begins */
     struct messages out, in;
 };

@@ -40,7 +40,7 @@ static void take(struct frame *frame)
     if (message) {
         message->at_ns = now_ns();
         message->kind = SENT;
-        message->radio = (uint32_t)(frame->transmitter[3] << 8 | frame->transmitter[4]);
+        message->radio = (uint32_t)radio_number(frame->transmitter);
         memcpy(&message->frame, frame, frame_bytes(frame));
         mailbox->out.head++;
     } else {

@@ -8,7 +8,6 @@ robot's guest. A run repeats to the byte.
 
 from __future__ import annotations
 
-import base64
 import ctypes
 import errno
 import json
@@ -22,8 +21,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
-
-import yaml
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
@@ -65,13 +62,8 @@ class Member:
     """Of its data partition."""
 
 
-def described(plan: Plan, board: Board) -> Fleet:
-    return realtime.fleet(plan.transport, board, "ibss")
-
-
-def members(plan: Plan, board: Board, keys: Path) -> list[Member]:
+def members(plan: Plan, fleet: Fleet, board: Board, keys: Path) -> list[Member]:
     """The flying robot's guest first, which has the station's radio, too."""
-    fleet = described(plan, board)
     flying = fleet.robot_with("valves")
     robots = sorted(fleet.robots.values(), key=lambda robot: robot != flying)
     library = air.compiled(air.MEMBER, board.architecture)
@@ -85,7 +77,7 @@ def members(plan: Plan, board: Board, keys: Path) -> list[Member]:
             session = _session(plan, fleet, board, robot, (radios, count))
             files = common | {f"{DIRECTORY}/session.json": json.dumps(session, sort_keys=True).encode()}
             if robot is flying:
-                files |= _of_the_station(plan, fleet, board, flying)
+                files |= _of_the_station(plan, fleet, board)
             nodes = [_changed(node, plan) for node in data_partition.nodes(fleet, robot)]
             found.append(Member(robot, tuple(range(radios, radios + count)), files, nodes))
             radios += count
@@ -107,10 +99,7 @@ def _session(plan: Plan, fleet: Fleet, board: Board, robot: Robot, radios: tuple
     }  # fmt: skip
     if robot is flying:
         others = [other for other in fleet.robots.values() if other is not flying]
-        tasks = [
-            {"name": "station", "computer": STATION, "file": f"{DIRECTORY}/station.yml"},
-            {"name": "plant", "computer": STATION, "file": f"{DIRECTORY}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
-        ]
+        tasks = virtual.lab_tasks(DIRECTORY)
         events = [asdict(event) for event in plan.events]
         length = fleet.network.subnet.prefixlen
         session |= {
@@ -121,12 +110,11 @@ def _session(plan: Plan, fleet: Fleet, board: Board, robot: Robot, radios: tuple
     return session
 
 
-def _of_the_station(plan: Plan, fleet: Fleet, board: Board, flying: Robot) -> dict[str, bytes]:
-    parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
+def _of_the_station(plan: Plan, fleet: Fleet, board: Board) -> dict[str, bytes]:
     return {
         f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
         f"{DIRECTORY}/station.yml": virtual.station(fleet),
-        f"{DIRECTORY}/plant.yml": virtual.plant(parameters, fleet, board, flying),
+        f"{DIRECTORY}/plant.yml": virtual.plant(plan, fleet, board),
     }
 
 
@@ -139,32 +127,33 @@ def _changed(node: Node, plan: Plan) -> Node:
 
 def fly(plan: Plan, board: Board, out: Path) -> Flight:
     """Fly it, in the directory `out`."""
-    board = described(plan, board).boards[board.name]
+    described = realtime.fleet(plan.transport, board, "ibss")
+    board = described.boards[board.name]
     (out / "keys").mkdir(parents=True, exist_ok=True)
     system = subject.build(board)
     emulator = machine.emulator()
     for name, sources in {"barrier.so": air.BARRIER, "conductor.so": air.CONDUCTOR}.items():
         (out / name).write_bytes(air.compiled(sources, "amd64"))
-    fleet = members(plan, board, out / "keys")
+    fleet = members(plan, described, board, out / "keys")
     console = out / fleet[0].robot.name / machine.CONSOLE
     title = f"{plan.name}: {len(fleet)} guests in lock-step"
     with ExitStack() as stack:
+        # Left after the guests have ended, which ends all that waits for them: Ctrl-C does, too.
+        pool = stack.enter_context(ThreadPoolExecutor(len(fleet)))
         guests = [stack.enter_context(_running(member, board, system, emulator, out)) for member in fleet]
         seconds = {plan.name: plan.seconds}
         stack.enter_context(progress.step(title, lambda: virtual.far(progress.text(console), seconds)))
-        with ThreadPoolExecutor(len(guests)) as pool:
-            told = pool.submit(_conduct, plan, fleet, guests, out).result()
-            directories = [out / member.robot.name for member in fleet]
-            contents = list(pool.map(partial(machine.ended, timeout_s=_RESULTS_LIMIT_S), guests, directories))
+        told = pool.submit(_conduct, plan, fleet, guests, out).result()
+        directories = [out / member.robot.name for member in fleet]
+        contents = list(pool.map(partial(machine.ended, timeout_s=_RESULTS_LIMIT_S), guests, directories))
     flight = out / "flight"
     flight.mkdir(exist_ok=True)
     (flight / "air.json").write_text(told)
-    answers = {member.robot.name: _answer(content) for member, content in zip(fleet, contents, strict=True)}
-    for name, encoded in [item for answer in answers.values() for item in answer["files"].items()]:
-        file = flight / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(base64.b64decode(encoded))
-    if errors := [f"{name}: {answer['error'].strip()}" for name, answer in answers.items() if "error" in answer]:
+    said = {
+        member.robot.name: virtual.unpack(results.received(content), flight)
+        for member, content in zip(fleet, contents, strict=True)
+    }
+    if errors := [f"{name}: {error}" for name, error in said.items() if error]:
         raise UserError("the flight failed in a guest:\n" + "\n".join(errors))
     return replace(Flight.read(flight), one_clock=False)
 
@@ -179,8 +168,7 @@ def _running(
     box, initrd = directory / "mailbox", directory / "initrd.img"
     box.write_bytes(bytes(air.MAILBOX_BYTES))
     commands = {"session": ["env", "-C", str(DIRECTORY), "python3", "-m", "lab.scenarios.member", "session.json"]}
-    nodes = sorted(member.nodes, key=lambda node: node.path.parts)
-    subject.write_initrd(system, initrd, {"scenarios": [], "commands": commands}, member.files, nodes)
+    subject.write_initrd(system, initrd, {"scenarios": [], "commands": commands}, member.files, member.nodes)
     extra = _shared_memory(box, out / "barrier.so", qemu.port_ids(board)[_bell(board)])
     if len(member.radios) > 1:
         extra += RELAYS
@@ -195,21 +183,10 @@ def _running(
 
 def _shared_memory(box: Path, barrier: Path, bell: str) -> tuple[str, ...]:
     """QEMU's arguments for a guest that shares its mailbox, and waits for others."""
-    memory = f"memory-backend-file,id=mailbox,share=on,mem-path={box},size={air.MAILBOX_BYTES}"
-    return (
-        "-object",
-        memory,
-        "-device",
-        "ivshmem-plain,memdev=mailbox",
-        "-plugin",
-        f"{barrier},mailbox={box},bell={bell}",
-    )
-
-
-def _answer(content: bytes) -> dict[str, Any]:
-    """Of member.py, in what a guest sent."""
-    answer: dict[str, Any] = json.loads(results.received(content)["commands"]["session"])
-    return answer
+    file, plugin = (str(path).replace(",", ",,") for path in (box, barrier))
+    memory = f"memory-backend-file,id=mailbox,share=on,mem-path={file},size={air.MAILBOX_BYTES}"
+    waits = f"{plugin},mailbox={file},bell={bell}"
+    return ("-object", memory, "-device", "ivshmem-plain,memdev=mailbox", "-plugin", waits)
 
 
 def _conduct(plan: Plan, fleet: Sequence[Member], guests: Sequence[subprocess.Popen[str]], out: Path) -> str:
@@ -238,5 +215,5 @@ def _conduct(plan: Plan, fleet: Sequence[Member], guests: Sequence[subprocess.Po
 
 def _why(guest: subprocess.Popen[str], directory: Path) -> str:
     """What a guest that ended too early has to say; UserError where QEMU does."""
-    answer = _answer(machine.ended(guest, directory, timeout_s=1))
-    return f"{directory.name}: {answer.get('error', 'ended before the others').strip()}"
+    document = results.received(machine.ended(guest, directory, timeout_s=1))
+    return f"{directory.name}: {virtual.unpack(document, directory / 'flight') or 'ended before the others'}"

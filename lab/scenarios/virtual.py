@@ -12,7 +12,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from unittest import mock
 
@@ -22,7 +22,7 @@ import yaml
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import dds_security, identity, inventory, message_keys
-from flotilla.fleet.model import Board, Fleet, Host, Robot
+from flotilla.fleet.model import Board, Fleet, Host
 from flotilla.station import telemetry
 from images.builder import runtime
 from lab import air
@@ -185,10 +185,22 @@ def station(described: Fleet) -> bytes:
     return _own("station.yml.j2", controllers=described.robots_with("control"), **streams)
 
 
-def plant(parameters: Mapping[str, object], described: Fleet, board: Board, flying: Robot) -> bytes:
+def plant(plan: Plan, described: Fleet, board: Board) -> bytes:
     """The task of the robot that flies, and of what measures it."""
-    gyro = gyro_device(described, board)
-    return _own("plant.yml.j2", parameters=parameters, robot_address=flying.address, gyro=gyro)
+    return _own(
+        "plant.yml.j2",
+        parameters=yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant),
+        robot_address=described.robot_with("valves").address,
+        gyro=gyro_device(described, board),
+    )
+
+
+def lab_tasks(directory: Path | PurePosixPath) -> list[dict[str, str]]:
+    """Of station and plant, as fly.py starts them, whose files are in a directory."""
+    return [
+        {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
+        {"name": "plant", "computer": STATION, "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
+    ]
 
 
 def _receivers(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> list[str]:
@@ -219,15 +231,11 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
     )
     flying = described.robot_with("valves")
     brought = _rendered(described, keys)
-    robot_parameters = yaml.safe_load((PLANT / "floating_robot.yml").read_text()) | dict(plan.plant)
     there = {
-        f"{directory}/plant.yml": plant(robot_parameters, described, board, flying),
+        f"{directory}/plant.yml": plant(plan, described, board),
         f"{directory}/station.yml": station(described),
     }
-    tasks = [
-        {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
-        {"name": "plant", "computer": STATION, "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
-    ]
+    tasks = lab_tasks(directory)
     if plan.second_station:
         # A file is its task's lock: two computers of one guest need two.
         there[f"{directory}/{SECOND}.yml"] = there[f"{directory}/station.yml"]
@@ -347,11 +355,17 @@ def run(there: Mapping[str, bytes], board: Board, out: Path, flights: Mapping[st
     with progress.step(title, lambda: far(progress.text(console), flights)):
         document = results.received(guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds))
     initrd.unlink()
+    if error := unpack(document, out / "flights"):
+        raise UserError(f"the flight failed in the guest:\n{error}")
+    return out / "flights"
+
+
+def unpack(document: Mapping[str, Any], directory: Path) -> str:
+    """Write the files that a guest's session left; what it said of an error, or nothing."""
     answer = json.loads(document["commands"]["session"])
     for name, content in answer["files"].items():
-        file = out / "flights" / name
+        file = directory / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(base64.b64decode(content))
-    if "error" in answer:
-        raise UserError(f"the flight failed in the guest:\n{answer['error'].strip()}")
-    return out / "flights"
+    error: str = answer.get("error", "")
+    return error.strip()

@@ -61,7 +61,7 @@ class Mailbox(ctypes.Structure):
 
     _fields_ = (
         ("waits", ctypes.c_uint32), ("joined", ctypes.c_uint32), ("leaves", ctypes.c_uint32),
-        ("ended", ctypes.c_uint32), ("full", ctypes.c_uint32), ("unused", ctypes.c_uint32),
+        ("ended", ctypes.c_uint32), ("full", ctypes.c_uint32),
         ("next_ns", ctypes.c_int64), ("out", Messages), ("in_", Messages),
     )  # fmt: skip
 
