@@ -29,6 +29,7 @@ from lab.emulators.ir104 import Ir104
 from lab.emulators.serial_line import SerialLine, UnixSocket
 from lab.qemu import qemu
 from lab.qemu.relay_ports import RelayPorts
+from lab.qemu.timing import LabError
 from tests.conftest import RobotGuest
 
 UNIT = "flotilla-task@heading.service"
@@ -126,8 +127,25 @@ class Loop:
     def unit(self, name: str) -> str:
         return self.robot.shell.run(["sudo", "systemctl", "show", "-P", name, UNIT]).stdout.strip()
 
-    def main_pid(self) -> int:
-        return int(self.unit("MainPID"))
+    def main_pid(self, then: str = "") -> int:
+        """The task's process, awaited while there is none: on a busy host late steps end it, and systemd starts it.
+
+        `then` is a command of the shell for this very process, `$pid`.
+        """
+        running = f'systemctl -q is-active {UNIT} && pid=$(systemctl show -P MainPID {UNIT}) && [ "$pid" != 0 ]'
+        wait = f"for i in $(seq 600); do {running} && break; pid=; sleep 0.1; done; : ${{pid:?}}; {then}\necho $pid"
+        return int(self.robot.shell.run(["sudo", "sh", "-e"], stdin=wait, timeout=SECONDS).stdout)
+
+    def of_one_process(self, ask: Callable[[int], None]) -> None:
+        """Asks and judges the task's process, and does so anew if another one took its place meanwhile."""
+        for _ in range(10):
+            pid = self.main_pid()
+            try:
+                return ask(pid)
+            except (AssertionError, LabError, UserError):
+                if self.main_pid() == pid:
+                    raise
+        pytest.fail(f"{UNIT} was started anew ten times while it was asked")
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +167,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReques
 
 def test_the_task_starts_with_the_robot(loop: Loop) -> None:
     """Nothing but late steps ends it, which is the host's doing while it boots."""
-    assert loop.unit("ActiveState") == "active"
+    loop.main_pid()
     journal = ["sudo", "journalctl", "-b", "-o", "cat", "-u", UNIT]
     said = [line for line in loop.robot.shell.run(journal).stdout.splitlines() if line.startswith("flotilla: ")]
     late = [line for line in said if re.search(r"\d+ in a row|no step ended for", line)]
@@ -172,7 +190,7 @@ def test_a_gyro_that_is_unplugged_closes_the_valves_until_it_is_back(loop: Loop)
     loop.gyro.unplug()
     assert loop.board.wait_relays(on=False), "valves stay open without a gyro"
     switched = len(loop.board.log)
-    loop.robot.shell.run(["sudo", "systemctl", "is-active", UNIT])  # a second or so in which nothing may move
+    loop.main_pid()  # a second or so in which nothing may move
     assert len(loop.board.log) == switched
     loop.gyro.replug()
     assert loop.board.wait_relays(on=True), "control does not resume"
@@ -180,28 +198,26 @@ def test_a_gyro_that_is_unplugged_closes_the_valves_until_it_is_back(loop: Loop)
 
 
 def test_a_second_start_is_refused(loop: Loop) -> None:
-    """On a busy host the first one may be started anew meanwhile, because steps were late."""
-    before = loop.main_pid()
-    done = loop.robot.shell.run(["flotilla-run", "/etc/flotilla/tasks/heading.yml"], check=False)
-    assert done.returncode == 3
-    found = re.search(r"runs already, as process (\d+); end that first", done.stderr)
-    assert found, done.stderr
-    assert before <= int(found[1]) <= loop.main_pid()
+    def refused(pid: int) -> None:
+        start = ["timeout", "20", "flotilla-run", "/etc/flotilla/tasks/heading.yml"]
+        done = loop.robot.shell.run(start, check=False)
+        assert done.returncode == 3
+        assert f"runs already, as process {pid}; end that first" in done.stderr
+
+    loop.of_one_process(refused)
 
 
 def test_a_stopped_executive_is_ended_by_the_watchdog_and_the_valves_close(loop: Loop) -> None:
     """Seen to fail without WatchdogSec=: the valves stay as they were."""
     loop.plant.kick(math.radians(15))
     assert loop.board.wait_relays(on=True)
-    pid = loop.main_pid()
-    loop.robot.shell.run(["sudo", "kill", "-STOP", str(pid)])
+    pid = loop.main_pid("kill -STOP $pid")
     assert loop.board.wait_relays(on=False), "valves stay open while the executive is stopped"
     wait_restarted(loop, pid)
 
 
 def test_a_killed_executive_is_restarted(loop: Loop, record_property: Callable[[str, object], None]) -> None:
-    pid = loop.main_pid()
-    loop.robot.shell.run(["sudo", "kill", "-KILL", str(pid)])
+    pid = loop.main_pid("kill -KILL $pid")
     wait_restarted(loop, pid)
     loop.plant.kick(math.radians(15))
     assert loop.board.wait_relays(on=True), "the restarted task does not control"
@@ -224,24 +240,26 @@ def wait_restarted(loop: Loop, pid: int) -> None:
 
 
 def test_the_task_has_only_the_privileges_it_needs(loop: Loop) -> None:
-    status = loop.robot.shell.run(["cat", f"/proc/{loop.main_pid()}/status"]).stdout
-    fields = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
-    cap_sys_rawio = 1 << 17
-    for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"):
-        assert int(fields[name], 16) == cap_sys_rawio, name
-    assert fields["Uid"].split() == [str(CONTROL)] * 4
-    assert fields["NoNewPrivs"].strip() == "1"
-    assert "VmLck" in fields
-    assert not fields["VmLck"].startswith("       0"), "memory is not locked"
+    def has(pid: int) -> None:
+        status = loop.robot.shell.run(["cat", f"/proc/{pid}/status"]).stdout
+        fields = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
+        cap_sys_rawio = 1 << 17
+        for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"):
+            assert int(fields[name], 16) == cap_sys_rawio, name
+        assert fields["Uid"].split() == [str(CONTROL)] * 4
+        assert fields["NoNewPrivs"].strip() == "1"
+        assert "VmLck" in fields
+        assert not fields["VmLck"].startswith("       0"), "memory is not locked"
+
+    loop.of_one_process(has)
     properties = "CapabilityBoundingSet,AmbientCapabilities"
     others = ["sudo", "systemctl", "show", "-p", properties, "flotilla-task@control.service"]
     shown = loop.robot.shell.run(others).stdout.splitlines()
     assert sorted(shown) == ["AmbientCapabilities=", "CapabilityBoundingSet="], "it drives no I/O ports"
 
 
-def attempted(loop: Loop, *user: str) -> set[str]:
+def attempted(loop: Loop, target: int, *user: str) -> set[str]:
     """What succeeds as a user, of what somebody tries who has taken over a task. None of it changes anything."""
-    target = loop.main_pid()
     script = "\n".join(f"({each.format(target=target)}) >/dev/null 2>&1 && echo '{each}'" for each in ATTEMPTS)
     said = loop.robot.shell.run(["sudo", *user, "sh"], stdin=f"{script}\ntrue\n", timeout=SECONDS).stdout
     return set(said.splitlines())
@@ -250,41 +268,53 @@ def attempted(loop: Loop, *user: str) -> set[str]:
 def test_who_takes_over_a_task_or_an_app_takes_over_nothing_else(loop: Loop) -> None:
     """With a task's user and groups. Seen to fail as user `robot`, whom tasks once ran as: it could write to the
     operator's home folder, from which the next shell takes commands, and signal sshd."""
-    status = loop.robot.shell.run(["cat", f"/proc/{loop.main_pid()}/status"]).stdout
-    (found,) = re.findall(r"^Groups:\t(.*)$", status, re.MULTILINE)
 
-    def as_user(number: int) -> list[str]:
-        groups = [each for each in found.split() if each != str(CONTROL)] + [str(number)]
-        own = [f"--reuid={number}", f"--regid={number}", f"--groups={','.join(groups)}"]
-        return ["setpriv", *own, "--bounding-set=-all", "--no-new-privs"]
+    def takes_over(pid: int) -> None:
+        status = loop.robot.shell.run(["cat", f"/proc/{pid}/status"]).stdout
+        (found,) = re.findall(r"^Groups:\t(.*)$", status, re.MULTILINE)
 
-    assert attempted(loop) == set(ATTEMPTS), "root may, so these are attempts"
-    assert attempted(loop, *as_user(CONTROL)) == OWN_TASKS
-    assert attempted(loop, *as_user(APP)) == set()
+        def as_user(number: int) -> list[str]:
+            groups = [each for each in found.split() if each != str(CONTROL)] + [str(number)]
+            own = [f"--reuid={number}", f"--regid={number}", f"--groups={','.join(groups)}"]
+            return ["setpriv", *own, "--bounding-set=-all", "--no-new-privs"]
+
+        assert attempted(loop, pid) == set(ATTEMPTS), "root may, so these are attempts"
+        assert attempted(loop, pid, *as_user(CONTROL)) == OWN_TASKS
+        assert attempted(loop, pid, *as_user(APP)) == set()
+
+    loop.of_one_process(takes_over)
 
 
 def test_the_control_thread_is_real_time(loop: Loop) -> None:
-    threads = loop.robot.shell.run(["ps", "-L", "-o", "comm=,cls=,rtprio=", "-p", str(loop.main_pid())]).stdout
-    classes = {line.split()[0]: line.split()[1:] for line in threads.splitlines()}
-    assert classes["heading"] == ["FF", "80"]
-    assert classes["gyro"] == ["FF", "79"]
+    def is_real_time(pid: int) -> None:
+        threads = loop.robot.shell.run(["ps", "-L", "-o", "comm=,cls=,rtprio=", "-p", str(pid)]).stdout
+        classes = {line.split()[0]: line.split()[1:] for line in threads.splitlines()}
+        assert classes["heading"] == ["FF", "80"]
+        assert classes["gyro"] == ["FF", "79"]
+
+    loop.of_one_process(is_real_time)
 
 
 def test_parameters_are_set_from_the_station(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = loop.robot.robot
     monkeypatch.setattr(ssh, "forwarded_port", lambda _: loop.robot.machine.ssh_port())
     file = yaml.safe_load(TASK.read_text())["blocks"]["attitude"]["parameters"]
-    assert parameters.param(robot, "heading", "attitude.kp") == str(file["kp"])
-    said = parameters.param(robot, "heading", "attitude.kp", "0.35")
-    assert re.fullmatch(rf"attitude\.kp: {file['kp']} → 0\.35 from step \d+ on", said)
-    assert parameters.param(robot, "heading", "attitude.kp") == "0.35"
-    journal = ["sudo", "journalctl", "-o", "cat", "-u", UNIT, "--no-pager"]
-    assert f"flotilla: heading: user 1000: {said}" in loop.robot.shell.run(journal).stdout.splitlines()
-    with pytest.raises(UserError, match="robot1: task heading: block attitude: parameter filter: -1 is outside 0 to "):
-        parameters.param(robot, "heading", "attitude.filter", "-1")
-    with pytest.raises(UserError, match="robot1: no task bearing runs here"):
-        parameters.param(robot, "bearing")
-    parameters.param(robot, "heading", "attitude.kp", str(file["kp"]))
+
+    def are_set(_: int) -> None:
+        assert parameters.param(robot, "heading", "attitude.kp") == str(file["kp"])
+        said = parameters.param(robot, "heading", "attitude.kp", "0.35")
+        assert re.fullmatch(rf"attitude\.kp: {file['kp']} → 0\.35 from step \d+ on", said)
+        assert parameters.param(robot, "heading", "attitude.kp") == "0.35"
+        journal = ["sudo", "journalctl", "-o", "cat", "-u", UNIT, "--no-pager"]
+        assert f"flotilla: heading: user 1000: {said}" in loop.robot.shell.run(journal).stdout.splitlines()
+        message = "robot1: task heading: block attitude: parameter filter: -1 is outside 0 to "
+        with pytest.raises(UserError, match=message):
+            parameters.param(robot, "heading", "attitude.filter", "-1")
+        with pytest.raises(UserError, match="robot1: no task bearing runs here"):
+            parameters.param(robot, "bearing")
+        parameters.param(robot, "heading", "attitude.kp", str(file["kp"]))
+
+    loop.of_one_process(are_set)
 
 
 def watching(*signals: str) -> list[str]:
@@ -295,20 +325,30 @@ def test_signals_are_watched_from_the_station(loop: Loop, monkeypatch: pytest.Mo
     """By the user who may log in, as the station does."""
     robot = loop.robot.robot
     monkeypatch.setattr(ssh, "forwarded_port", lambda _: loop.robot.machine.ssh_port())
-    assert scope.record(robot, watching("gyro.rate", "gyro.flag"), tmp_path / "rates.csv") == 20
-    head, *rows = [line.split(",") for line in (tmp_path / "rates.csv").read_text().splitlines()]
-    assert head == ["step", "release_ns", "lost", "gyro.rate", "gyro.flag"]
-    steps = [int(row[0]) for row in rows]
-    assert steps == list(range(steps[0], steps[0] + 100, 5))
-    with pytest.raises(UserError, match=r"robot1: task heading: gyro\.rat: dsp3000 has no output rat; it has rate, "):
-        scope.show(robot, watching("gyro.rat"))
+
+    def are_watched(pid: int) -> None:
+        file = tmp_path / f"rates-{pid}.csv"
+        assert scope.record(robot, watching("gyro.rate", "gyro.flag"), file) == 20
+        head, *rows = [line.split(",") for line in file.read_text().splitlines()]
+        assert head == ["step", "release_ns", "lost", "gyro.rate", "gyro.flag"]
+        steps = [int(row[0]) for row in rows]
+        assert steps == list(range(steps[0], steps[0] + 100, 5))
+        unknown = r"robot1: task heading: gyro\.rat: dsp3000 has no output rat; it has rate, "
+        with pytest.raises(UserError, match=unknown):
+            scope.show(robot, watching("gyro.rat"))
+
+    loop.of_one_process(are_watched)
 
 
 def test_parameters_are_the_users_of_the_task_alone(loop: Loop) -> None:
     argv = ["sudo", "-u", "nobody", "flotilla-param", "heading", "attitude.kp", "1"]
-    refused = loop.robot.shell.run(argv, check=False)
-    assert (refused.returncode, refused.stdout) == (1, "")
-    assert "task heading answers the user that it runs as" in refused.stderr
+
+    def refused(_: int) -> None:
+        done = loop.robot.shell.run(argv, check=False)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert "task heading answers the user that it runs as" in done.stderr
+
+    loop.of_one_process(refused)
 
 
 def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:
@@ -337,12 +377,16 @@ def test_dds_proves_who_the_robot_is(loop: Loop, fleet: Fleet) -> None:
     restart = f"systemctl daemon-reload; systemctl reset-failed {UNIT}; systemctl restart {UNIT}"
     user = f"prlimit --rtprio=99 setpriv --reuid={CONTROL} --regid={CONTROL} --clear-groups"
     ask = f"""
-    export "$(tr '\\0' '\\n' </proc/$(systemctl show -P MainPID {UNIT})/environ | grep ^CYCLONEDDS_URI=)"
+    export "$(tr '\\0' '\\n' </proc/$pid/environ | grep ^CYCLONEDDS_URI=)"
     {user} ddsperf -i {network.dds_domain} -D 600 sub >/dev/null 2>&1 &
     while [ -d /proc/$! ] && ! grep libdds_security_crypto /proc/$!/maps; do sleep 0.1; done
     kill $!
     """
     there = ["sudo", "sh", "-e"]
     loop.robot.shell.run(there, stdin="\n".join([*write, f"chmod 600 {DDS_SECURITY}", restart, ""]), timeout=SECONDS)
-    assert loop.unit("ActiveState") == "active"
-    assert "libdds_security_crypto.so" in loop.robot.shell.run(there, stdin=ask, timeout=SECONDS).stdout
+
+    def has_plugins(pid: int) -> None:
+        said = loop.robot.shell.run(there, stdin=f"pid={pid}\n{ask}", timeout=SECONDS).stdout
+        assert "libdds_security_crypto.so" in said
+
+    loop.of_one_process(has_plugins)
