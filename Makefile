@@ -297,7 +297,7 @@ scope: | setup ## signals of a task that runs: ROBOT=1 TASK=heading [SIGNALS="gy
 	    $(call option,--before,BEFORE) $(call option,--csv,CSV) -- $(call need,TASK) $(call each_given,SIGNALS)
 
 ##@ Real time
-.PHONY: latency latency-accept boot-time hwcheck scenarios scenarios-accept
+.PHONY: latency latency-accept boot-time hwcheck accept scenarios scenarios-accept
 # What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.
 measured = $(call option,--board,BOARD) $(call option,--kernel,KERNEL) $(call option,--plan,PLAN)
 latency: | setup-tests ## latency in virtual time against the accepted run, or limits (an hour): PLAN=standard [BOARD= KERNEL=lean|debian|no-rt PLAN=disk]; or TARGET=ssh:robot3
@@ -305,6 +305,9 @@ latency: | setup-tests ## latency in virtual time against the accepted run, or l
 
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
 	$(Q)$(FLOTILLA) hwcheck $(call need,ROBOT) $(call option,--seconds,SECONDS)
+
+accept: | setup-tests ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 WATCHDOG=1]
+	$(Q)$(FLOTILLA) accept $(call need,ROBOT) $(call option,--plan,PLAN) $(call option,--seconds,SECONDS) $(if $(filter-out 0,$(WATCHDOG)),--watchdog)
 
 latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
 	$(Q)$(FLOTILLA) latency-accept $(measured)

@@ -66,6 +66,18 @@ def _latency_accept_arguments(parser: argparse.ArgumentParser) -> None:
     command.accept_arguments(parser)
 
 
+def _accept(arguments: argparse.Namespace) -> None:
+    from lab.acceptance import command
+
+    command.run(arguments)
+
+
+def _accept_arguments(parser: argparse.ArgumentParser) -> None:
+    from lab.acceptance import command
+
+    command.arguments(parser)
+
+
 def _boot_time(arguments: argparse.Namespace) -> None:
     from lab.latency import command
 
@@ -162,6 +174,7 @@ COMMANDS = (
     Command("Lab", "latency", "measure latency in virtual time and judge it", _latency, _latency_arguments),
     Command("Lab", "latency-accept", "measure, and make that the accepted latency", _latency_accept,
             _latency_accept_arguments),
+    Command("Lab", "accept", "judge a robot by what its board's file asks", _accept, _accept_arguments),
     Command("Lab", "boot-time", "show where a boot spends its time", _boot_time, _boot_time_arguments),
     Command("Lab", "scenarios", "fly a robot by four computers and write the report", _scenarios,
             _scenarios_arguments),

@@ -248,6 +248,28 @@ class Qemu(_Model):
     `port1` the second, and so on. The lab provides a chardev for each port; the console's needs no device."""
 
 
+class Acceptance(_Model):
+    """What `make accept` asks of a computer of this kind. No card image depends on it."""
+
+    memory_mib: Annotated[Integer, between(16, 65536, unit="MiB")] = 64
+    """At least so much, as the kernel counts it: a few per cent less than what is plugged in."""
+    clock_source: Word = "tsc"
+    """What the kernel must read time from; others take microseconds."""
+    wake_up_us: Annotated[Integer, between(1, 1_000_000, unit="µs")] = 100
+    """The latest wake-up of a real-time thread, under every load of `make latency`, as one of two threads that
+    interrupt each other, and by a semaphore. 100 µs of jitter are what the published systems had."""
+    byte_us: Annotated[Integer, between(1, 1_000_000, unit="µs")] = 1000
+    """The latest byte from a serial port's interrupt to the thread that waits for it, under every load."""
+    hardware_latency_us: Annotated[Integer, between(1, 1_000_000, unit="µs")] = 20
+    """The longest moment in which the hardware takes the processor away from the kernel (SMI)."""
+    card_read_mb_s: Annotated[float, Strict(), between(0, 10_000, unit="MB/s")] = 2
+    """At least so fast from the card."""
+    card_write_mb_s: Annotated[float, Strict(), between(0, 10_000, unit="MB/s")] = 0.5
+    """At least so fast to the card, until the last byte is there."""
+    temperature_c: Annotated[Integer, between(20, 125, unit="°C")] = 85
+    """Of the hottest sensor, at most."""
+
+
 def _by_tty(ports: dict[str, Port]) -> dict[str, Port]:
     # Ansible keeps no order.
     return dict(sorted(ports.items(), key=lambda item: (len(item[1].tty), item[1].tty)))
@@ -285,6 +307,8 @@ class Board(_Model):
     names the ports. Leave it out for a board without a watchdog, or with one that needs more than a byte."""
     qemu: Qemu
     """The machine that stands in for the board in `make boot` and in tests."""
+    acceptance: Acceptance = Field(default=Acceptance(), exclude=True)
+    """What `make accept` asks of a computer of this kind."""
 
     @property
     def machine(self) -> str:

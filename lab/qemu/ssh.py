@@ -148,7 +148,7 @@ class Ssh:
             raise LabError(f"{self._robot.name}: cannot write {path}: {_text(done.stderr)}")
 
     def close(self) -> None:
-        self._hang_up()
+        self.hang_up()
         self._scratch.cleanup()
 
     def _run(self, argv: Sequence[str], timeout: float, stdin: bytes) -> subprocess.CompletedProcess[bytes]:
@@ -168,7 +168,7 @@ class Ssh:
 
     def _try_to_connect(self, deadline: Deadline) -> str | None:
         """Start the shared connection: None when it stands, else what ssh said."""
-        self._hang_up()
+        self.hang_up()
         # `LocalCommand` runs once the connection stands, so its output is the event to wait for.
         ready = ["-o", "PermitLocalCommand=yes", "-o", "LocalCommand=echo ready"]
         alive = ["-o", "ConnectTimeout=20", "-o", "ServerAliveInterval=10", "-o", "ServerAliveCountMax=18"]
@@ -186,7 +186,8 @@ class Ssh:
         self._master.kill()
         return self._master.stderr.read().strip() or "no answer"
 
-    def _hang_up(self) -> None:
+    def hang_up(self) -> None:
+        """End the connection; the next command makes another."""
         self._leave_root()
         if self._master:
             self._master.kill()

@@ -55,7 +55,7 @@ ELSEWHERE = {
     "sudo ip address add 10.42.0.254/24 dev eth0": "changes this computer's network",
     "ping 10.42.0.3": "needs the robot",
     "make hwcheck ROBOT=3": "needs the robot; tests/boot/shared asks guests the same",
-    "make latency TARGET=ssh:robot3": "needs the robot; test_latency_target.py measures a guest",
+    "make latency TARGET=ssh:robot3": "needs the robot; tests/boot/shared/test_acceptance.py measures a guest",
     **dict.fromkeys(
         (
             'make provision ARGS="--check --diff"',

@@ -1,0 +1,53 @@
+"""`make accept ROBOT=3`: one command that says whether a robot is what its board's file asks."""
+
+from __future__ import annotations
+
+import argparse
+from typing import get_args
+
+from flotilla.cli.command import robot_argument
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
+from lab.acceptance import checks, facts, outcome, report
+from lab.latency import target
+from lab.qemu.timing import LabError
+
+
+def run(arguments: argparse.Namespace) -> None:
+    fleet = inventory.load_fleet()
+    robot = inventory.robot(fleet, arguments.robot)
+    others = list(outcome.of_board(robot.board))  # one that is not as it was signed is said before the hour, not after
+    out = paths.BUILD / "latency" / f"{robot.name}-accept"
+    try:
+        with target.connect(robot) as shell:
+            plan = None if arguments.plan == "none" else arguments.plan
+            found = facts.ask(fleet, robot, shell, out, plan=plan, seconds=arguments.seconds, bite=arguments.watchdog)
+    except LabError as error:
+        raise UserError(f"{robot.name}: {error}; is it on and reachable? `make ssh ROBOT={robot.number}`") from error
+    made = checks.judge(fleet, robot, found, arguments.plan)
+    file = outcome.write(made)
+    page = report.write(made, others)
+    print(said(made))
+    print(f"{paths.shown(page)}: the report; {paths.shown(file)}: its figures, signed by the operator's key")
+    if made.failures:
+        raise UserError(f"{robot.name} is not accepted: {len(made.failures)} of {len(made.outcomes)} checks fail")
+
+
+def said(made: outcome.Acceptance) -> str:
+    """What fails, a line each, and how many of the others hold or were not shown."""
+    counts = {state: sum(each.state == state for each in made.outcomes) for state in get_args(outcome.State)}
+    lines = [f"fails: {each}" for each in made.failures]
+    return "\n".join(
+        [*lines, f"{counts['holds']} checks hold, {counts['fails']} fail, {counts['not shown']} not shown"]
+    )
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    robot_argument(parser)
+    parser.add_argument(
+        "--plan", choices=("standard", "quick", "none"), default="standard",
+        help="of latency: standard, a minute for each scenario; quick, five seconds for some; none",
+    )  # fmt: skip
+    parser.add_argument("--seconds", type=int, default=60, help="of each other meter (%(default)s)")
+    parser.add_argument("--watchdog", action="store_true", help="hang the computer, for its watchdog to restart it")

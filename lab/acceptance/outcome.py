@@ -1,0 +1,124 @@
+"""What a robot was found to be: each check, and all figures, in a file that the operator's key signs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import keys
+
+NAMESPACE = "flotilla-acceptance"
+"""What the signature is for (`ssh-keygen -Y`)."""
+SIGNED_BY = "operator"
+State = Literal["holds", "fails", "not shown"]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Outcome(_Model):
+    """Of one check."""
+
+    part: str
+    what: str
+    """What was looked at: `COM5`, `wake-up under load`."""
+    state: State
+    found: str
+    """In words, with figures; why, where it was not shown."""
+    remedy: str = ""
+    """What to do about a failure."""
+
+    def __str__(self) -> str:
+        said = f"{self.part}: {self.what}: {self.found}"
+        return f"{said}; {self.remedy}" if self.remedy else said
+
+
+class Acceptance(_Model):
+    """Of one robot at one time."""
+
+    format: Literal[1] = 1
+    robot: str
+    board: str
+    made: datetime
+    emulated: bool
+    """A guest: its times are the host's, and none is judged."""
+    computer: str
+    kernel: str
+    """`uname -r`."""
+    release: str
+    """Of the running slot."""
+    plan: str
+    outcomes: list[Outcome]
+    figures: dict[str, float]
+    """By name with unit: what compares between robots, and over time."""
+    histograms_us: dict[str, dict[int, int]]
+    """Samples by latency, by scenario and quantity."""
+
+    @property
+    def failures(self) -> list[Outcome]:
+        return [each for each in self.outcomes if each.state == "fails"]
+
+    @property
+    def name(self) -> str:
+        return f"{self.robot}-{self.made:%Y%m%dT%H%M%SZ}"
+
+
+def directory() -> Path:
+    return paths.BUILD / "reports" / "acceptance"
+
+
+def write(made: Acceptance) -> Path:
+    """The file, `ROBOT-TIME.json`, with its signature beside it, `.json.sig`."""
+    directory().mkdir(parents=True, exist_ok=True)
+    file = directory() / f"{made.name}.json"
+    beside = file.with_suffix(".new")
+    beside.write_text(json.dumps(made.model_dump(mode="json"), indent=1, sort_keys=True) + "\n")
+    argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", NAMESPACE, "-f", str(keys.operator())]
+    done = subprocess.run(argv, input=beside.read_bytes(), capture_output=True, check=False)
+    if done.returncode:
+        beside.unlink()
+        raise UserError(f"{paths.shown(file)}: cannot be signed: {done.stderr.decode(errors='replace').strip()}")
+    signature_of(file).write_bytes(done.stdout)
+    return beside.rename(file)
+
+
+def signature_of(file: Path) -> Path:
+    return file.with_name(f"{file.name}.sig")
+
+
+def is_signed(file: Path) -> bool:
+    """Whether the operator's key, or the one before it, signed the file as it is."""
+    public = [keys.public(each) for each in (keys.operator(), keys.former_operator()) if each]
+    allowed = file.with_suffix(".allowed")
+    allowed.write_text("".join(f'{SIGNED_BY} namespaces="{NAMESPACE}" {key}\n' for key in public))
+    argv = ["ssh-keygen", "-Y", "verify", "-f", str(allowed), "-I", SIGNED_BY, "-n", NAMESPACE]
+    argv += ["-s", str(signature_of(file))]
+    try:
+        return subprocess.run(argv, input=file.read_bytes(), capture_output=True, check=False).returncode == 0
+    finally:
+        allowed.unlink()
+
+
+def read(file: Path) -> Acceptance:
+    """UserError where the file is not as it was signed."""
+    if not is_signed(file):
+        raise UserError(f"{paths.shown(file)}: is not as the operator's key signed it; remove it, and accept the robot")
+    try:
+        return Acceptance.model_validate_json(file.read_text())
+    except ValidationError as error:
+        raise UserError(f"{paths.shown(file)}: is no acceptance: {error.errors()[0]['msg']}") from error
+
+
+def of_board(board: str) -> Iterator[Acceptance]:
+    """All there are of robots of a board, the oldest first."""
+    found = (read(file) for file in sorted(directory().glob("*.json")))
+    yield from sorted((each for each in found if each.board == board), key=lambda each: each.made)
