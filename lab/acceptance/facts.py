@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -136,4 +137,4 @@ def _bitten(robot: Robot, shell: Ssh) -> float:
                     return lasted
             except LabError:  # it hangs, or boots
                 shell.hang_up()
-    return float("inf")
+    return math.inf

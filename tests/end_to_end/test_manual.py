@@ -55,6 +55,10 @@ ELSEWHERE = {
     "sudo ip address add 10.42.0.254/24 dev eth0": "changes this computer's network",
     "ping 10.42.0.3": "needs the robot",
     "make hwcheck ROBOT=3": "needs the robot; tests/boot/shared asks guests the same",
+    **dict.fromkeys(
+        ("make accept ROBOT=3", "make accept ROBOT=3 PLAN=none WATCHDOG=1"),
+        "needs the robot; tests/boot/shared/test_acceptance.py accepts a guest",
+    ),
     "make latency TARGET=ssh:robot3": "needs the robot; tests/boot/shared/test_acceptance.py measures a guest",
     **dict.fromkeys(
         (

@@ -53,6 +53,7 @@ GIVEN = {
     "latency-accept": ["BOARD", "KERNEL", "PLAN"],
     "boot-time": ["BOARD"],
     "hwcheck": ["ROBOT", "SECONDS"],
+    "accept": ["ROBOT", "PLAN", "SECONDS"],
     "scenarios": ["ROBOTS", "SIDE"],
 }
 WORDS = {
