@@ -50,7 +50,7 @@ class Asked:
 
     def timed(self, *, holds: bool) -> State:
         """Of a check that an emulator can only fail by its host."""
-        return "not shown" if self.emulated else "holds" if holds else "fails"
+        return "not judged" if self.emulated else "holds" if holds else "fails"
 
     def words(self, found: str) -> str:
         return f"{found}: {EMULATED}" if self.emulated else found
@@ -73,12 +73,14 @@ def _description(asked: Asked) -> Iterator[Outcome]:
     drift = state.release_drift(found["release"], asked.facts.release)
     if asked.facts.release is None:
         absent = f"its image is not on this computer: make image ROBOT={asked.robot.number}"
-        yield Outcome(part=part, what="release", state="not shown", found=absent)
+        yield Outcome(part=part, what="release", state="not judged", found=absent)
     else:
         yield _outcome(part, "release", [drift] if drift else [], "the one of its image on this computer", "")
     complaints = health.complaints(found["tasks"], asked.fleet.health)
     tasks = len(found["tasks"])
-    yield _outcome(part, "control tasks", complaints, f"{tasks} do as `health:` wants", "look at them: make top ASK=1")
+    yield _outcome(
+        part, "health", complaints, f"{tasks} control tasks are as `health:` wants", "look at them: make top ASK=1"
+    )
 
 
 def _outcome(part: str, what: str, wrong: list[str], right: str, remedy: str) -> Outcome:
@@ -121,7 +123,7 @@ def _messages(lines: list[str]) -> Iterator[Outcome]:
 def _temperatures(asked: Asked) -> Iterator[Outcome]:
     limit_c, found = asked.board.acceptance.temperature_c, asked.facts.parts["temperatures"]
     if not found:
-        yield Outcome(part="computer", what="temperature", state="not shown", found="no sensor has a driver here")
+        yield Outcome(part="computer", what="temperature", state="not judged", found="no sensor has a driver here")
     for name, celsius in found.items():
         wrong = [f"{celsius:.0f} °C, more than {limit_c}"] if celsius > limit_c else []
         yield _outcome("computer", f"temperature of {name}", wrong, f"{celsius:.0f} °C", "look after its cooling")
@@ -131,7 +133,7 @@ def _watchdog(asked: Asked) -> Iterator[Outcome]:
     found, part = asked.facts.parts["watchdog"], "watchdog"
     if not asked.board.watchdog and not found["is_there"]:
         said = "the board's file names none"
-        yield Outcome(part=part, what="device", state="not shown", found=said)
+        yield Outcome(part=part, what="device", state="not judged", found=said)
         return
     wrong = [] if found["is_there"] else ["/dev/watchdog is missing"]
     yield _outcome(part, "device", wrong, found["device"], "`modules:` of the board's file names its driver")
@@ -141,9 +143,9 @@ def _watchdog(asked: Asked) -> Iterator[Outcome]:
     bite_s = asked.facts.bite_s
     if bite_s is None:
         said = f"a hang was not tried: make accept ROBOT={asked.robot.number} WATCHDOG=1"
-        yield Outcome(part=part, what="bite", state="not shown", found=said)
+        yield Outcome(part=part, what="bite", state="not judged", found=said)
     elif math.isinf(bite_s) and asked.emulated:
-        yield Outcome(part=part, what="bite", state="not shown", found="this emulator's watchdog does nothing")
+        yield Outcome(part=part, what="bite", state="not judged", found="this emulator's watchdog does nothing")
     else:
         wrong = ["a hang was not ended"] if math.isinf(bite_s) else []
         yield _outcome(part, "bite", wrong, f"{bite_s:.0f} s after a hang it answers again", "does it reset the board?")
@@ -154,7 +156,7 @@ def _serial(asked: Asked) -> Iterator[Outcome]:
         tty = asked.board.ports[name].tty
         what = f"{name} ({tty})"
         if users := fact.get("users"):
-            yield Outcome(part="serial", what=what, state="not shown", found=f"in use by {', '.join(users)}")
+            yield Outcome(part="serial", what=what, state="not judged", found=f"in use by {', '.join(users)}")
             continue
         wrong, remedy = [], ""
         if "came" not in fact and "error" not in fact and tty != asked.board.console.tty:
@@ -258,7 +260,7 @@ def _latency(asked: Asked) -> Iterator[Outcome]:
     for name, outcome in found.scenarios.items():
         if outcome.missing:
             said = f"needs {', '.join(outcome.missing)}"
-            yield Outcome(part="real time", what=f"{outcome.title} ({name})", state="not shown", found=said)
+            yield Outcome(part="real time", what=f"{outcome.title} ({name})", state="not judged", found=said)
 
 
 CHECKS: Mapping[str, Callable[[Asked], Iterator[Outcome]]] = {

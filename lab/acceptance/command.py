@@ -35,11 +35,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def said(made: outcome.Acceptance) -> str:
-    """What fails, a line each, and how many of the others hold or were not shown."""
+    """What fails, a line each, and how many of the others hold or were not judged."""
     counts = {state: sum(each.state == state for each in made.outcomes) for state in get_args(outcome.State)}
     lines = [f"fails: {each}" for each in made.failures]
     return "\n".join(
-        [*lines, f"{counts['holds']} checks hold, {counts['fails']} fail, {counts['not shown']} not shown"]
+        [*lines, f"{counts['holds']} checks hold, {counts['fails']} fail, {counts['not judged']} not judged"]
     )
 
 

@@ -18,7 +18,7 @@ from flotilla.fleet import keys
 NAMESPACE = "flotilla-acceptance"
 """What the signature is for (`ssh-keygen -Y`)."""
 SIGNED_BY = "operator"
-State = Literal["holds", "fails", "not shown"]
+State = Literal["holds", "fails", "not judged"]
 
 
 class _Model(BaseModel):
@@ -33,7 +33,7 @@ class Outcome(_Model):
     """What was looked at: `COM5`, `wake-up under load`."""
     state: State
     found: str
-    """In words, with figures; why, where it was not shown."""
+    """In words, with figures; why, where it was not judged."""
     remedy: str = ""
     """What to do about a failure."""
 

@@ -58,7 +58,7 @@ def test_a_board_that_does_what_its_file_asks_is_accepted(fleet: Fleet, robot: R
     made = checks.judge(fleet, robot, answered(), "none")
     assert not made.emulated
     assert made.failures == []
-    assert {each.what for each in made.outcomes if each.state == "not shown"} == {"release", "bite", "COM1 (ttyS0)"}
+    assert {each.what for each in made.outcomes if each.state == "not judged"} == {"release", "bite", "COM1 (ttyS0)"}
 
 
 def _set(*path: str) -> Callable[[Facts, Any], None]:
@@ -162,7 +162,7 @@ def test_no_time_of_a_guest_is_judged(fleet: Fleet, robot: Robot) -> None:
     made = checks.judge(fleet, robot, found, "quick")
     assert made.emulated
     assert made.failures == []
-    shown = {each.what: each.found for each in made.outcomes if each.state == "not shown"}
+    shown = {each.what: each.found for each in made.outcomes if each.state == "not judged"}
     assert shown["wake-up, idle"] == f"5000 µs at the latest, at most 100: {checks.EMULATED}"
 
 
