@@ -306,8 +306,9 @@ latency: | setup-tests ## latency in virtual time against the accepted run, or l
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
 	$(Q)$(FLOTILLA) hwcheck $(call need,ROBOT) $(call option,--seconds,SECONDS)
 
-accept: | setup-tests ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 WATCHDOG=1]
-	$(Q)$(FLOTILLA) accept $(call need,ROBOT) $(call option,--plan,PLAN) $(call option,--seconds,SECONDS) $(if $(filter-out 0,$(WATCHDOG)),--watchdog)
+accept: | setup-tests ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 RELAYS=1 WATCHDOG=1]
+	$(Q)$(FLOTILLA) accept $(call need,ROBOT) $(call option,--plan,PLAN) $(call option,--seconds,SECONDS) $(if $(filter-out 0,$(RELAYS)),--relays) \
+	    $(if $(filter-out 0,$(WATCHDOG)),--watchdog)
 
 latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
 	$(Q)$(FLOTILLA) latency-accept $(measured)

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 
 from flotilla.fleet.model import Board, Fleet, Robot
 from flotilla.robot import health, state
+from lab.acceptance import relays
 from lab.acceptance.facts import Facts
 from lab.acceptance.outcome import Acceptance, Outcome, State
 
@@ -263,6 +264,18 @@ def _latency(asked: Asked) -> Iterator[Outcome]:
             yield Outcome(part="real time", what=f"{outcome.title} ({name})", state="not judged", found=said)
 
 
+def _relays(asked: Asked) -> Iterator[Outcome]:
+    for board in relays.boards(asked.robot) if asked.facts.relays is None else ():
+        said = f"nobody watched: make accept ROBOT={asked.robot.number} RELAYS=1"
+        yield Outcome(part="relays", what=f"of {board.task}", state="not judged", found=said)
+    for relay in asked.facts.relays or ():
+        wrong = [] if relay.seen else ["whoever watched saw another than it should"]
+        if relay.mismatch:
+            wrong.append("its register reads back other than written")
+        what = f"{relay.board.task}: relay {relay.number}"
+        yield _outcome("relays", what, wrong, "switches", f"`{relay.board.block}:` of the task, the board, its wiring")
+
+
 CHECKS: Mapping[str, Callable[[Asked], Iterator[Outcome]]] = {
     "computer": _computer,
     "temperatures": _temperatures,
@@ -276,7 +289,6 @@ CHECKS: Mapping[str, Callable[[Asked], Iterator[Outcome]]] = {
 """By the part of `on_robot.py` that they need."""
 BY_HAND = (
     "what leaves a serial connector: the UART's own loopback ends before the line drivers",
-    "relays: whether each switches what hangs on it",
     "sensors that no control task of the robot reads",
     "the radio's range, and power that is cut while it flies",
     "the card's age: such cards do not tell it",
@@ -294,7 +306,7 @@ def judge(fleet: Fleet, robot: Robot, facts: Facts, plan: str, now: datetime | N
             outcomes.append(Outcome(part=part, what="could not be asked", state="fails", found=facts.errors[name]))
         else:
             outcomes += check(asked)
-    outcomes += _latency(asked)
+    outcomes += [*_relays(asked), *_latency(asked)]
     computer = facts.parts.get("computer", {})
     slots = facts.state["release"] or {"running": None, "slots": {}}
     running = slots["slots"].get(slots["running"], {})

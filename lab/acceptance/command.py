@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import get_args
 
 from flotilla.cli.command import robot_argument
@@ -15,6 +16,8 @@ from lab.qemu.timing import LabError
 
 
 def run(arguments: argparse.Namespace) -> None:
+    if arguments.relays and not sys.stdin.isatty():
+        raise UserError("RELAYS=1 asks whoever watches the relays: run it on a terminal")
     fleet = inventory.load_fleet()
     robot = inventory.robot(fleet, arguments.robot)
     others = list(outcome.of_board(robot.board))  # one that is not as it was signed is said before the hour, not after
@@ -22,7 +25,10 @@ def run(arguments: argparse.Namespace) -> None:
     try:
         with target.connect(robot) as shell:
             plan = None if arguments.plan == "none" else arguments.plan
-            found = facts.ask(fleet, robot, shell, out, plan=plan, seconds=arguments.seconds, bite=arguments.watchdog)
+            found = facts.ask(
+                fleet, robot, shell, out, plan=plan, seconds=arguments.seconds, bite=arguments.watchdog,
+                person=_person if arguments.relays else None,
+            )  # fmt: skip
     except LabError as error:
         raise UserError(f"{robot.name}: {error}; is it on and reachable? `make ssh ROBOT={robot.number}`") from error
     made = checks.judge(fleet, robot, found, arguments.plan)
@@ -32,6 +38,13 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"{paths.shown(page)}: the report; {paths.shown(file)}: its figures, signed by the operator's key")
     if made.failures:
         raise UserError(f"{robot.name} is not accepted: {len(made.failures)} of {len(made.outcomes)} checks fail")
+
+
+def _person(question: str) -> bool:
+    """Whoever sits at the terminal."""
+    while (answer := input(f"{question} [y/n] ").strip().lower()) not in ("y", "n"):
+        pass
+    return answer == "y"
 
 
 def said(made: outcome.Acceptance) -> str:
@@ -50,4 +63,5 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="of latency: standard, a minute for each scenario; quick, five seconds for some; none",
     )  # fmt: skip
     parser.add_argument("--seconds", type=int, default=60, help="of each other meter (%(default)s)")
+    parser.add_argument("--relays", action="store_true", help="switch each relay, and ask whether it does")
     parser.add_argument("--watchdog", action="store_true", help="hang the computer, for its watchdog to restart it")

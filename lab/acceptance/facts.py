@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet, Robot
 from flotilla.robot import release, state
-from lab.acceptance import on_robot
+from lab.acceptance import on_robot, relays
+from lab.acceptance.relays import Relay
 from lab.latency import results, target
 from lab.latency.results import Results
 from lab.qemu.ssh import Ssh
@@ -52,6 +53,8 @@ class Facts:
     """Interfaces before and after some MiB each way."""
     latency: Results | None = None
     """None: it was not asked for."""
+    relays: list[Relay] | None = None
+    """None: nobody watched."""
     bite_s: float | None = None
     """From a hang until another boot answered; None: not tried. Infinite: none did."""
 
@@ -59,9 +62,11 @@ class Facts:
 def ask(
     fleet: Fleet, robot: Robot, shell: Ssh, out: Path, *,
     plan: results.Plan | None, seconds: int, inventory: Path = paths.INVENTORY, bite: bool = False,
+    person: Callable[[str], bool] | None = None,
 ) -> Facts:  # fmt: skip
     """All there is to know. `plan`: of latency, None for none; `seconds`: of each other meter; `bite`: hang the
-    computer, for its watchdog to act."""
+    computer, for its watchdog to act; `person`: watches the relays."""
+    watched = relays.watch(robot, shell, person) if person else None  # first, while the person is there
     board = fleet.boards[robot.board]
     described = _described(fleet, robot, shell, inventory)
     before = _parts(shell, board, fleet, robot, ["network"], 0)
@@ -76,6 +81,7 @@ def ask(
         release=release.wanted(robot),
         link=(before["network"].get("facts"), answers["network"].get("facts")),
         latency=target.measure(robot, board, shell, plan, out) if plan else None,
+        relays=watched,
         bite_s=_bitten(robot, shell) if bite else None,
     )
 

@@ -24,6 +24,7 @@ from flotilla.fleet import identity
 from flotilla.fleet.model import Fleet
 from flotilla.fleet.transport import duration_s
 from flotilla.robot import parameters, scope, ssh
+from lab.acceptance import relays
 from lab.emulators.dsp3000 import Dsp3000
 from lab.emulators.ir104 import Ir104
 from lab.emulators.serial_line import SerialLine, UnixSocket
@@ -362,6 +363,27 @@ def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:
 
 def test_task_file_is_the_inventorys(loop: Loop, tmp_path: Path) -> None:
     assert loop.robot.shell.run(["cat", "/etc/flotilla/tasks/heading.yml"]).stdout == TASK.read_text()
+
+
+def test_relays_are_watched_one_by_one(loop: Loop, fleet: Fleet) -> None:
+    """By `make accept RELAYS=1`; the third relay is stuck. Whoever watches looks at the emulated board."""
+    asked = []
+
+    def person(question: str) -> bool:
+        asked.append(question)
+        number = int(re.findall(r"relay (\d+)", question)[0])
+        return [at for at, on in enumerate(loop.board.relays, 1) if on] == [number]
+
+    loop.board.stuck[3] = False
+    try:
+        watched = relays.watch(loop.robot.robot, loop.robot.shell, person)
+    finally:
+        loop.board.stuck.clear()
+    assert asked[0] == "heading: is relay 1 on, and no other?"
+    assert [relay.number for relay in watched] == list(range(1, 9))
+    assert [relay.number for relay in watched if not relay.seen] == [3]
+    assert all(relay.mismatch for relay in watched), "these ports read back the same, whatever was written"
+    loop.main_pid()  # it controls again
 
 
 def test_dds_proves_who_the_robot_is(loop: Loop, fleet: Fleet) -> None:

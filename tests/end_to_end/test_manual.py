@@ -56,7 +56,7 @@ ELSEWHERE = {
     "ping 10.42.0.3": "needs the robot",
     "make hwcheck ROBOT=3": "needs the robot; tests/boot/shared asks guests the same",
     **dict.fromkeys(
-        ("make accept ROBOT=3", "make accept ROBOT=3 PLAN=none WATCHDOG=1"),
+        ("make accept ROBOT=3", "make accept ROBOT=1 PLAN=none RELAYS=1", "make accept ROBOT=3 PLAN=none WATCHDOG=1"),
         "needs the robot; tests/boot/shared/test_acceptance.py accepts a guest",
     ),
     "make latency TARGET=ssh:robot3": "needs the robot; tests/boot/shared/test_acceptance.py measures a guest",

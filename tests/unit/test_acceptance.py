@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import copy
 import html
+import io
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -19,11 +20,13 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import keys
 from flotilla.fleet.model import Fleet, Robot
-from lab.acceptance import checks, command, facts, outcome, report
+from lab.acceptance import checks, command, facts, outcome, relays, report
 from lab.acceptance.facts import Facts
 from lab.acceptance.outcome import Acceptance
+from lab.acceptance.relays import Relay
 from lab.latency import results, target
 from lab.latency.results import Latency
+from lab.qemu.ssh import Ssh
 from lab.qemu.timing import LabError
 
 ANSWERED = json.loads((Path(__file__).parent / "acceptance.json").read_text())
@@ -138,6 +141,33 @@ def test_the_watchdogs_bite(fleet: Fleet, robot: Robot, bite_s: float, said: lis
     assert [each.split(";")[0] for each in found] == said
 
 
+def test_relays_are_judged_by_who_watched(fleet: Fleet) -> None:
+    robot = fleet.robots[1]
+    (board,) = relays.boards(robot)
+    assert (board.task, board.base, board.channels) == ("heading", 0x300, tuple(range(1, 9)))
+    made = checks.judge(fleet, robot, answered(), "none")
+    (unwatched,) = [each for each in made.outcomes if each.part == "relays"]
+    assert unwatched.found == "nobody watched: make accept ROBOT=1 RELAYS=1"
+    watched = [Relay(board, 1, seen=True, mismatch=False), Relay(board, 2, seen=False, mismatch=True)]
+    said = failures(fleet, robot, replace(answered(), relays=watched))
+    assert [each for each in said if each.startswith("relays")] == [
+        "relays: heading: relay 2: whoever watched saw another than it should; its register reads back other than "
+        "written; `relays:` of the task, the board, its wiring"
+    ]
+
+
+def test_relays_want_a_terminal(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    with pytest.raises(UserError, match="RELAYS=1 asks whoever watches the relays: run it on a terminal"):
+        command.run(argparse.Namespace(robot=1, plan="none", seconds=1, relays=True, watchdog=False))
+
+
+def test_a_robot_without_relays_is_not_asked_for_them(robot: Robot) -> None:
+    """Before anything is asked of it."""
+    with pytest.raises(UserError, match="robot3 has no control task with a block ir104-pbf: leave out RELAYS=1"):
+        relays.watch(robot, cast(Ssh, None), lambda _: True)
+
+
 def _results(worst_us: int) -> results.Results:
     scenario = results.Outcome(title="idle", latencies={"wake-up": Latency.of({12: 999, worst_us: 1})})
     lacking = results.Outcome(title="disk", missing=["/dev/sda"])
@@ -212,7 +242,7 @@ def test_a_robot_that_fails_is_an_error_and_is_reported(
     found.parts["watchdog"]["is_there"] = False
     monkeypatch.setattr(target, "connect", _shell)
     monkeypatch.setattr(facts, "ask", lambda *_, **__: found)
-    asked = argparse.Namespace(robot=3, plan="none", seconds=1, watchdog=False)
+    asked = argparse.Namespace(robot=3, plan="none", seconds=1, relays=False, watchdog=False)
     with pytest.raises(UserError, match=r"^robot3 is not accepted: 1 of \d+ checks fail$"):
         command.run(asked)
     said = capsys.readouterr().out.splitlines()
@@ -228,5 +258,5 @@ def test_a_robot_that_does_not_answer(directory: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(target, "connect", _shell)
     monkeypatch.setattr(facts, "ask", silent)
     with pytest.raises(UserError, match="robot3: no SSH within 600 s: no route; is it on and reachable"):
-        command.run(argparse.Namespace(robot=3, plan="none", seconds=1, watchdog=False))
+        command.run(argparse.Namespace(robot=3, plan="none", seconds=1, relays=False, watchdog=False))
     assert not directory.exists()
