@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -365,8 +366,11 @@ def test_task_file_is_the_inventorys(loop: Loop, tmp_path: Path) -> None:
     assert loop.robot.shell.run(["cat", "/etc/flotilla/tasks/heading.yml"]).stdout == TASK.read_text()
 
 
-def test_relays_are_watched_one_by_one(loop: Loop, fleet: Fleet) -> None:
+def test_relays_are_watched_one_by_one(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     """By `make accept RELAYS=1`; the third relay is stuck. Whoever watches looks at the emulated board."""
+    (described,) = relays.boards(loop.robot.robot)
+    some = replace(described, channels=(1, 3, 8))  # each takes an emulated Pentium III five seconds
+    monkeypatch.setattr(relays, "boards", lambda _: [some])
     asked = []
 
     def person(question: str) -> bool:
@@ -380,7 +384,7 @@ def test_relays_are_watched_one_by_one(loop: Loop, fleet: Fleet) -> None:
     finally:
         loop.board.stuck.clear()
     assert asked[0] == "heading: is relay 1 on, and no other?"
-    assert [relay.number for relay in watched] == list(range(1, 9))
+    assert [relay.number for relay in watched] == [1, 3, 8]
     assert [relay.number for relay in watched if not relay.seen] == [3]
     assert all(relay.mismatch for relay in watched), "these ports read back the same, whatever was written"
     loop.main_pid()  # it controls again
