@@ -57,9 +57,9 @@ ELSEWHERE = {
     "make hwcheck ROBOT=3": "needs the robot; tests/boot/shared asks guests the same",
     **dict.fromkeys(
         ("make accept ROBOT=3", "make accept ROBOT=1 PLAN=none RELAYS=1", "make accept ROBOT=3 PLAN=none WATCHDOG=1"),
-        "needs the robot; tests/boot/shared/test_acceptance.py accepts a guest",
+        "needs the robot; tests/boot/shared/test_robot_acceptance.py accepts a guest",
     ),
-    "make latency TARGET=ssh:robot3": "needs the robot; tests/boot/shared/test_acceptance.py measures a guest",
+    "make latency TARGET=ssh:robot3": "needs the robot; tests/boot/shared/test_robot_acceptance.py measures a guest",
     **dict.fromkeys(
         (
             'make provision ARGS="--check --diff"',
