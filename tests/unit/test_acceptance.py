@@ -196,6 +196,13 @@ def test_no_time_of_a_guest_is_judged(fleet: Fleet, robot: Robot) -> None:
     assert shown["wake-up, idle"] == f"5000 µs at the latest, at most 100: {checks.EMULATED}"
 
 
+def test_limits_enter_no_image(fleet: Fleet) -> None:
+    board = fleet.boards["smartcoret3"]
+    stricter = board.model_copy(update={"acceptance": board.acceptance.model_copy(update={"wake_up_us": 7})})
+    assert stricter != board
+    assert stricter.model_dump_json() == board.model_dump_json()
+
+
 def _made(fleet: Fleet, robot: Robot, found: Facts, days: int = 0) -> Acceptance:
     return checks.judge(fleet, robot, found, "quick", NOON + timedelta(days=days))
 
