@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import subprocess
 import tarfile
 import time
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from pathlib import Path
 
 from flotilla.common import cache, host, namespace, paths, progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import release_keys
+from flotilla.fleet import release_keys, ssh_signatures
 from flotilla.fleet.model import Board, Fleet, Releases
 from images.builder import manifest, slot
 from images.builder.build import BoardBuild, board_build
@@ -107,8 +106,7 @@ def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> di
     for key in trusted["keys"]:
         private = paths.KEYS / f"{key['name']}_ed25519"
         if private.exists():
-            argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", release_keys.NAMESPACE, "-f", str(private)]
-            signed[key["name"]] = _ran(argv, text.read_bytes())
+            signed[key["name"]] = ssh_signatures.sign(text.read_bytes(), private, release_keys.NAMESPACE)
     for file in elsewhere:
         name = next((key["name"] for key in trusted["keys"] if signed_by(text, file, key)), None)
         if name is None:
@@ -128,22 +126,8 @@ def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> di
 
 
 def signed_by(text: Path, signature: Path, key: Mapping[str, str]) -> bool:
-    """Whether a key of `release_keys.document` has made this signature of a file. Writes beside it."""
-    allowed = text.with_suffix(".allowed")
-    allowed.write_text(f'{key["name"]} namespaces="{release_keys.NAMESPACE}" {key["key"]}\n')
-    argv = ["ssh-keygen", "-Y", "verify", "-f", str(allowed), "-I", key["name"], "-n", release_keys.NAMESPACE]
-    argv += ["-s", str(signature)]
-    try:
-        return subprocess.run(argv, input=text.read_bytes(), capture_output=True, check=False).returncode == 0
-    finally:
-        allowed.unlink()
-
-
-def _ran(argv: list[str], content: bytes) -> bytes:
-    done = subprocess.run(argv, input=content, capture_output=True, check=False)
-    if done.returncode:
-        raise UserError(f"{' '.join(argv)} failed: {done.stderr.decode(errors='replace').strip()}")
-    return done.stdout
+    """Whether a key of `release_keys.document` has made this signature of a file."""
+    return ssh_signatures.is_signed(text.read_bytes(), signature, [key["key"]], release_keys.NAMESPACE)
 
 
 def _add(archive: tarfile.TarFile, name: str, content: io.BufferedIOBase, size: int, epoch: int) -> None:

@@ -156,11 +156,12 @@ def _serial(asked: Asked) -> Iterator[Outcome]:
     for name, fact in asked.facts.parts["serial"].items():
         tty = asked.board.ports[name].tty
         what = f"{name} ({tty})"
-        if users := fact.get("users"):
-            yield Outcome(part="serial", what=what, state="not judged", found=f"in use by {', '.join(users)}")
+        if fact.get("users") or tty == asked.board.console.tty:
+            users = ", ".join(fact.get("users", ())) or "the console"
+            yield Outcome(part="serial", what=what, state="not judged", found=f"in use by {users}")
             continue
         wrong, remedy = [], ""
-        if "came" not in fact and "error" not in fact and tty != asked.board.console.tty:
+        if "came" not in fact and "error" not in fact:
             wrong = [f"its UART is {fact['uart']}"]
             remedy = f"compare `ports:` in board_{asked.robot.board}.yml with the board and its jumpers"
         elif "error" in fact:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -13,11 +12,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import keys
+from flotilla.fleet import keys, ssh_signatures
 
 NAMESPACE = "flotilla-acceptance"
 """What the signature is for (`ssh-keygen -Y`)."""
-SIGNED_BY = "operator"
 State = Literal["holds", "fails", "not judged"]
 
 
@@ -82,12 +80,7 @@ def write(made: Acceptance) -> Path:
     file = directory() / f"{made.name}.json"
     beside = file.with_suffix(".new")
     beside.write_text(json.dumps(made.model_dump(mode="json"), indent=1, sort_keys=True) + "\n")
-    argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", NAMESPACE, "-f", str(keys.operator())]
-    done = subprocess.run(argv, input=beside.read_bytes(), capture_output=True, check=False)
-    if done.returncode:
-        beside.unlink()
-        raise UserError(f"{paths.shown(file)}: cannot be signed: {done.stderr.decode(errors='replace').strip()}")
-    signature_of(file).write_bytes(done.stdout)
+    signature_of(file).write_bytes(ssh_signatures.sign(beside.read_bytes(), keys.operator(), NAMESPACE))
     return beside.rename(file)
 
 
@@ -98,14 +91,7 @@ def signature_of(file: Path) -> Path:
 def is_signed(file: Path) -> bool:
     """Whether the operator's key, or the one before it, signed the file as it is."""
     public = [keys.public(each) for each in (keys.operator(), keys.former_operator()) if each]
-    allowed = file.with_suffix(".allowed")
-    allowed.write_text("".join(f'{SIGNED_BY} namespaces="{NAMESPACE}" {key}\n' for key in public))
-    argv = ["ssh-keygen", "-Y", "verify", "-f", str(allowed), "-I", SIGNED_BY, "-n", NAMESPACE]
-    argv += ["-s", str(signature_of(file))]
-    try:
-        return subprocess.run(argv, input=file.read_bytes(), capture_output=True, check=False).returncode == 0
-    finally:
-        allowed.unlink()
+    return ssh_signatures.is_signed(file.read_bytes(), signature_of(file), public, NAMESPACE)
 
 
 def read(file: Path) -> Acceptance:

@@ -105,6 +105,14 @@ def test_each_fault_is_named(
     assert fault.startswith(said)
 
 
+def test_a_console_that_nobody_uses_is_not_judged(fleet: Fleet, robot: Robot) -> None:
+    """Seen to fail: its bytes were said to have come back, though none were sent."""
+    found = answered()
+    found.parts["serial"]["COM1"]["users"] = []
+    (console,) = [each for each in checks.judge(fleet, robot, found, "none").outcomes if each.what == "COM1 (ttyS0)"]
+    assert (console.state, console.found) == ("not judged", "in use by the console")
+
+
 @pytest.mark.parametrize(
     ("found", "said"),
     [
