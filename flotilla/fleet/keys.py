@@ -13,9 +13,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import subprocess
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from flotilla.common import paths
@@ -29,17 +32,34 @@ def make(name: str, comment: str) -> Path:
     """The private key `name`, made if there is none."""
     path = paths.KEYS / name
     if not path.exists():
-        paths.KEYS.mkdir(parents=True, exist_ok=True, mode=0o700)
-        beside = path.with_name(f".{name}.new")
-        beside.unlink(missing_ok=True)
-        argv = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", comment, "-f", str(beside)]
-        try:
-            subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
-        except subprocess.CalledProcessError as error:
-            raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
-        _public_file(beside).rename(_public_file(path))
-        beside.rename(path)
+        with alone():  # provisioning renders robots' files in processes of their own
+            if not path.exists():
+                _generate(path, comment)
     return path
+
+
+def _generate(path: Path, comment: str) -> None:
+    beside = path.with_name(f".{path.name}.new")
+    beside.unlink(missing_ok=True)
+    argv = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", comment, "-f", str(beside)]
+    try:
+        subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    except subprocess.CalledProcessError as error:
+        raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
+    _public_file(beside).rename(_public_file(path))
+    beside.rename(path)
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """No other process is in here for the same directory of keys. Not to be nested."""
+    paths.KEYS.mkdir(parents=True, exist_ok=True, mode=0o700)
+    directory = os.open(paths.KEYS, os.O_RDONLY)
+    try:
+        fcntl.flock(directory, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(directory)
 
 
 def public(private: Path) -> str:

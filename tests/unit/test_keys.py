@@ -162,6 +162,44 @@ def test_an_interrupted_rotation_leaves_a_key_that_robots_admit(
     assert before in {now.read_bytes(), (former := keys.former_operator()) and former.read_bytes()}
 
 
+MAKE = """
+from flotilla.fleet import keys
+print("ready", flush=True)
+input()
+keys.operator()
+"""
+
+
+def test_processes_at_once_make_one_key() -> None:
+    """Provisioning renders robots' files in processes of their own, and a newer checkout may need one key more.
+
+    Seen to fail without `keys.alone`: one process found the key that another was about to rename.
+    """
+    for file in paths.KEYS.glob("operator_ed25519*"):
+        file.unlink()
+    argv, environment = [sys.executable, "-c", MAKE], os.environ | {"KEYS": str(paths.KEYS)}
+    processes = [
+        subprocess.Popen(
+            argv, cwd=paths.PROJECT, env=environment, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        for _ in range(6)
+    ]  # fmt: skip
+    for process in processes:
+        assert process.stdout
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        assert process.stdin
+        process.stdin.write("\n")
+        process.stdin.flush()
+    for process in processes:
+        _, stderr = process.communicate()
+        assert process.returncode == 0, stderr
+    private = paths.KEYS / "operator_ed25519"
+    read = subprocess.run(["ssh-keygen", "-y", "-f", private], check=True, capture_output=True, text=True).stdout
+    assert read.split()[:2] == keys.public(private).split()
+
+
 # --- backup ---
 
 
