@@ -122,13 +122,22 @@ requirements: | setup ## lock the Python environment anew from requirements.in
 	    --no-header --no-annotate --quiet requirements.in -o requirements.lock
 
 ##@ Keys
-.PHONY: rotate-key revoke-key backup-keys restore-keys
+.PHONY: rotate-key revoke-key admit-operator revoke-operator operators backup-keys restore-keys
 rotate-key: | setup ## a new key for a robot or the operator: make rotate-key ROBOT=3 or KEY=operator, provision, then RETIRE=1 [FORCE=1]
 	$(Q)$(FLOTILLA) rotate-key $(if $(value KEY),$(call given,KEY),$(call need,ROBOT)) $(if $(filter-out 0,$(RETIRE)),--retire) \
 	    $(if $(filter-out 0,$(FORCE)),--force)
 
 revoke-key: | setup ## refuse the host key of a robot that is in other hands: make revoke-key ROBOT=3, then provision the others
 	$(Q)$(FLOTILLA) revoke-key $(call need,ROBOT)
+
+admit-operator: | setup ## let a person into all robots for some days: make admit-operator NAME=alice KEY_FILE=alice.pub [DAYS=30] [OUT=directory]
+	$(Q)$(FLOTILLA) admit-operator $(call option,--days,DAYS) $(call option,--out,OUT) -- $(call need,NAME) $(call need,KEY_FILE)
+
+revoke-operator: | setup ## refuse a person's certificates: make revoke-operator NAME=alice, then provision
+	$(Q)$(FLOTILLA) revoke-operator $(call need,NAME)
+
+operators: | setup ## who has a certificate, until when, expired or revoked
+	$(Q)$(FLOTILLA) operators
 
 backup-keys: | setup ## all keys in one encrypted file: make backup-keys OUT=FILE [PASSWORD_FILE=]
 	$(Q)$(FLOTILLA) backup-keys $(call need,OUT) $(call option,--password-file,PASSWORD_FILE)

@@ -245,6 +245,45 @@ def _revoke_key(arguments: argparse.Namespace) -> None:
     )
 
 
+def _admit_operator(arguments: argparse.Namespace) -> None:
+    from flotilla.common import paths
+    from flotilla.fleet import inventory, operators
+
+    fleet = inventory.load_fleet()
+    folder, admission = operators.admit(fleet, arguments.name, arguments.key_file, arguments.days, arguments.out)
+    print(
+        f"{paths.shown(folder)}: a certificate for {admission.name} until {operators.shown(admission.until)}, and "
+        f"known_hosts; from that folder, with the key's private half: ssh -i KEY -o "
+        f"CertificateFile={operators.CERTIFICATE} -o UserKnownHostsFile=known_hosts robot@ADDRESS"
+    )
+
+
+def _admit_operator_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.fleet import operators
+
+    parser.add_argument("name", help="of the person: small letters, digits and hyphens")
+    parser.add_argument("key_file", type=Path, help="the person's public key")
+    parser.add_argument("--days", type=int, default=operators.DAYS, help="how long the certificate lasts (%(default)s)")
+    parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where to (build/operators/NAME)")
+
+
+def _revoke_operator(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import operators
+
+    operators.revoke(arguments.name)
+    print(f"{arguments.name}: robots refuse all certificates of that name once they have the list: `make provision`")
+
+
+def _revoke_operator_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", help="of the person")
+
+
+def _operators(_: argparse.Namespace) -> None:
+    from flotilla.fleet import operators
+
+    print(operators.table())
+
+
 def _backup_keys(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths
     from flotilla.fleet import key_backup
@@ -578,6 +617,10 @@ COMMANDS = (
             _rotate_key_arguments),
     Command("Keys", "revoke-key", "refuse the host key of a robot that is in other hands", _revoke_key,
             robot_argument),
+    Command("Keys", "admit-operator", "sign a certificate that lets a person into all robots for some days",
+            _admit_operator, _admit_operator_arguments),
+    Command("Keys", "revoke-operator", "refuse a person's certificates", _revoke_operator, _revoke_operator_arguments),
+    Command("Keys", "operators", "show who has a certificate, and until when", _operators),
     Command("Keys", "backup-keys", "write all keys to one encrypted file", _backup_keys, _key_backup_arguments),
     Command("Keys", "restore-keys", "put them back", _restore_keys, _key_backup_arguments),
     Command("Robots", "ssh", "open a shell on a robot, or on its guest when one runs", _ssh, robot_argument),

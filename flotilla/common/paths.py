@@ -19,6 +19,8 @@ IMAGES = BUILD / "images"
 """Card images with what belongs to them."""
 BUNDLES = BUILD / "bundles"
 """Update bundles, `BOARD.bundle`."""
+OPERATORS = BUILD / "operators"
+"""Certificates to hand out, a folder for each person."""
 GUESTS = BUILD / "fleet" / "guests.yml"
 """Ansible's inventory of the virtual fleet, while it runs."""
 

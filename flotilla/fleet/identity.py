@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import apps, dds_security, interfaces, keys, message_keys, privileges, transport
+from flotilla.fleet import apps, dds_security, interfaces, keys, message_keys, operators, privileges, transport
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Fleet, Host, Robot
 
@@ -74,6 +74,8 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "message_key": shared_keys.between,
         "time_key": shared_keys.time,
         "operator_key": keys.public(keys.operator()),
+        "operator_authority": keys.public(operators.authority()),
+        "revoked_operators": operators.revoked(),
         # Stable, and not to be guessed back to anything (machine-id(5)).
         "machine_id": hashlib.sha256(f"machine-id {host_keys[robot.name]}".encode()).hexdigest()[:32],
     }

@@ -6,6 +6,9 @@
 | `operator_ed25519` | what every robot admits; it may have a passphrase, if an agent has it |
 | `NAME_ed25519.retired` | the former one, accepted until it is retired: public of a robot, private of the operator |
 | `revoked_keys` | public host keys that nobody accepts any more, a line each with the robot's name |
+| `operator_authority` | what signs certificates of further operators: operators.py |
+| `operators` | who has such a certificate, and until when |
+| `revoked_operators` | public keys of operators whom robots refuse |
 | `fleet_secret` | where keys of messages come from: message_keys.py |
 | `dds_authority` | what signs who may send which DDS topics: dds_security.py |
 | `known_hosts` | what of that `ssh` on this computer accepts; written anew when it differs |
@@ -89,7 +92,7 @@ def host_keys(fleet: Fleet) -> dict[str, str]:
     pinned += "".join(f"@revoked * {key}\n" for key in revoked())
     known = paths.KEYS / "known_hosts"
     if not known.exists() or known.read_text() != pinned:
-        _write(known, pinned)
+        write(known, pinned)
     return keys
 
 
@@ -107,7 +110,7 @@ def revocations() -> Counter[str]:
 
 def rotate_host_key(fleet: Fleet, robot: Robot) -> None:
     """Give a robot a new host key. The old one is accepted on this computer until `retire_host_key`."""
-    _write(_retired(robot), host_keys(fleet)[robot.name] + "\n")
+    write(_retired(robot), host_keys(fleet)[robot.name] + "\n")
     _remove(of_robot(robot))
     host_keys(fleet)
 
@@ -124,7 +127,7 @@ def revoke_host_key(fleet: Fleet, robot: Robot) -> None:
     if _retired(robot).exists():
         lost.append(_retired(robot).read_text().strip())
     before = _revoked().read_text() if _revoked().exists() else ""
-    _write(_revoked(), before + "".join(f"{key} {robot.name}\n" for key in lost))
+    write(_revoked(), before + "".join(f"{key} {robot.name}\n" for key in lost))
     _retired(robot).unlink(missing_ok=True)
     _remove(of_robot(robot))
     host_keys(fleet)
@@ -198,7 +201,8 @@ def write_once(file: Path, text: str) -> None:
         beside.unlink()
 
 
-def _write(file: Path, text: str) -> None:
+def write(file: Path, text: str) -> None:
+    """Whole or not at all, whatever was there."""
     beside = file.with_name(f".{file.name}.{os.getpid()}")
     beside.write_text(text)
     beside.rename(file)

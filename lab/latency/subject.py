@@ -212,7 +212,7 @@ def identity_nodes(board: Board, keys: Path) -> list[Node]:
     fleet, measured = robot(board)
     keys.mkdir()
     with mock.patch.object(paths, "KEYS", keys):
-        computable_keys.write([f"{measured.name}_ed25519", "operator_ed25519"])
+        computable_keys.write([f"{measured.name}_ed25519", "operator_ed25519", "operator_authority"])
         return data_partition.nodes(fleet, measured)
 
 

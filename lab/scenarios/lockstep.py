@@ -71,7 +71,9 @@ def members(plan: Plan, fleet: Fleet, board: Board, keys: Path) -> list[Member]:
     common = {f"{DIRECTORY}/lab/scenarios/{name}": (HERE / name).read_bytes() for name in programs} | {_MEMBER: library}
     found, radios = [], 0
     with mock.patch.object(paths, "KEYS", keys):
-        computable_keys.write([*(f"{robot.name}_ed25519" for robot in robots), "operator_ed25519"])
+        computable_keys.write(
+            [*(f"{robot.name}_ed25519" for robot in robots), "operator_ed25519", "operator_authority"]
+        )
         for robot in robots:
             count = 2 if robot is flying else 1
             session = _session(plan, fleet, board, robot, (radios, count))

@@ -557,6 +557,13 @@ def test_key_is_one_that_openssh_reads(tmp_path: Path) -> None:
     assert read.split()[:2] == public.split()[:2]
 
 
+def test_an_identity_repeats(tmp_path: Path) -> None:
+    """With other keys a run would differ from the accepted one. Seen to fail without the authority of operators."""
+    board = inventory.load_fleet().board()
+    first, second = (subject.identity_nodes(board, tmp_path / name) for name in ("first", "second"))
+    assert first == second
+
+
 def test_machine_is_the_board_in_virtual_time(tmp_path: Path) -> None:
     board = inventory.load_fleet().boards["smartcoret3"]
     qemu = machine.Emulator(read_lock("emulator"), tmp_path / "tree")

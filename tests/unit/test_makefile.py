@@ -35,6 +35,8 @@ GIVEN = {
     "deploy": ["ROBOT", "APP", "RUN"],
     "rotate-key": ["KEY"],
     "revoke-key": ["ROBOT"],
+    "admit-operator": ["NAME", "KEY_FILE", "DAYS", "OUT"],
+    "revoke-operator": ["NAME"],
     "backup-keys": ["OUT", "PASSWORD_FILE"],
     "restore-keys": ["FILE", "PASSWORD_FILE"],
     "releases": ["ROBOT"],
