@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from flotilla.common import paths
+from flotilla.fleet import operators
 from flotilla.fleet.model import Board, Fleet
 from flotilla.robot import ssh
 from tests.boot.guests import SECONDS, has_its_identity, sh
@@ -57,6 +61,58 @@ def test_nobody_else_gets_in(robot: RobotGuest, tmp_path: Path) -> None:
     stranger = _ssh(robot, "true", IdentityFile=str(key))
     # The only method named is the one offered: passwords are not asked for.
     assert "Permission denied (publickey)" in stranger.stderr, f"a strange key: {stranger}"
+
+
+def _sign(key: Path, authority: Path, principal: str, valid: str) -> Path:
+    """A certificate for a key, as no command of ours makes it."""
+    argv = ["ssh-keygen", "-q", "-s", str(authority), "-I", "alice", "-n", principal, "-V", valid, f"{key}.pub"]
+    subprocess.run(argv, check=True)
+    return key.with_name(f"{key.name}-cert.pub").rename(key.with_name("certificate"))
+
+
+def _gets_in(robot: RobotGuest, key: Path, certificate: Path) -> bool:
+    done = _ssh(robot, "sudo -n id -u", IdentityFile=str(key), CertificateFile=str(certificate))
+    assert done.stdout == "0\n" or "Permission denied (publickey)" in done.stderr, f"neither in nor refused: {done}"
+    return done.returncode == 0
+
+
+@pytest.fixture
+def stranger(tmp_path: Path) -> Path:
+    """The private key of somebody whom nobody has admitted yet."""
+    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(tmp_path / "alice")], check=True)
+    return tmp_path / "alice"
+
+
+def test_who_has_a_certificate_gets_in_until_it_is_revoked(
+    robot: RobotGuest, fleet: Fleet, stranger: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the files that `make admit-operator` hands out. sshd reads the list at each log-in; others still get in."""
+    shutil.copytree(paths.KEYS, tmp_path / "keys")
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+    folder, _ = operators.admit(fleet, "boot-test", stranger.with_suffix(".pub"), 30, tmp_path / "folder")
+    certificate, revoked = folder / operators.CERTIFICATE, "/etc/ssh/revoked_operators"
+    changes = {"IdentityFile": str(stranger), "CertificateFile": str(certificate)}
+    done = _ssh(robot, "sudo -n id -u", UserKnownHostsFile=str(folder / "known_hosts"), **changes)
+    assert done.stdout == "0\n", done
+    key = " ".join(stranger.with_suffix(".pub").read_text().split()[:2])
+    sh(robot, f"cp {revoked} /run/revoked_operators && echo '{key}' >>{revoked}")
+    try:
+        assert not _gets_in(robot, stranger, certificate), "revoked, and let in"
+        assert _ssh(robot, "echo in").stdout == "in\n", "the operator is refused, too"
+    finally:
+        sh(robot, f"cat /run/revoked_operators >{revoked} && rm /run/revoked_operators")
+    assert _gets_in(robot, stranger, certificate)
+
+
+def test_a_certificate_that_has_ended_or_is_not_for_robots_is_refused(
+    robot: RobotGuest, stranger: Path, tmp_path: Path
+) -> None:
+    authority, another = operators.authority(), tmp_path / "another"
+    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(another)], check=True)
+    assert _gets_in(robot, stranger, _sign(stranger, authority, "robot", "always:forever"))
+    assert not _gets_in(robot, stranger, _sign(stranger, another, "robot", "always:forever")), "of another authority"
+    assert not _gets_in(robot, stranger, _sign(stranger, authority, "root", "always:forever")), "for another user"
+    assert not _gets_in(robot, stranger, _sign(stranger, authority, "robot", "20200101:20200102")), "expired"
 
 
 def test_nobody_has_a_password(robot: RobotGuest) -> None:
