@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
+from pathlib import Path
 
 from tests.boot.guests import sh
+from tests.boot.shared.probes import forbidden
 from tests.conftest import RobotGuest
 
 EXPOSURE = 2.5
 """At most, by `systemd-analyze security`: 0 could do nothing, 10 anything."""
+MORE = {"flotilla-task@any.service": 3.4, "flotilla-app@any.service": 3.4}
+"""What drives actuators has no namespace of mounts: docs/decisions/0079-services-without-what-they-do-not-need.md."""
 
 
 def _exposure(robot: RobotGuest, *units: str) -> dict[str, float]:
@@ -17,11 +22,42 @@ def _exposure(robot: RobotGuest, *units: str) -> dict[str, float]:
 
 
 def test_no_service_of_ours_may_do_what_it_does_not_need(robot: RobotGuest) -> None:
-    """Seen to fail without the drop-in of all of them, and where task and app lacked their own lines."""
-    listed = sh(robot, "systemctl list-unit-files --no-legend 'flotilla-*.service'").split("\n")
+    """Seen to fail without the drop-in of all services, and when a task could open any kind of socket."""
+    listed = sh(robot, "systemctl list-unit-files --no-legend 'flotilla-*.service'").splitlines()
     units = [line.split()[0].replace("@.", "@any.") for line in listed]
-    assert {"flotilla-task@any.service", "flotilla-app@any.service", "flotilla-receive.service"} <= set(units)
+    assert {*MORE, "flotilla-receive.service"} <= set(units)
     found = _exposure(robot, *units)
     assert set(found) == set(units)
-    assert not (exposed := {unit: level for unit, level in found.items() if level > EXPOSURE}), exposed
+    exposed = {unit: level for unit, level in found.items() if level > MORE.get(unit, EXPOSURE)}
+    assert not exposed, exposed
     assert _exposure(robot, "chrony.service")["chrony.service"] > EXPOSURE, "the figures tell services apart"
+
+
+UNIT = "flotilla-task@forbidden.service"
+DROP_IN = """[Service]
+Type=oneshot
+ExecStart=
+ExecStart=/usr/bin/python3 /run/forbidden.py
+ExecStopPost=
+Restart=no
+WatchdogSec=0
+StandardOutput=truncate:/run/forbidden.json
+"""
+
+
+def test_a_control_task_makes_no_system_call_that_it_does_not_need(robot: RobotGuest) -> None:
+    """In a control task's own service, but for what that executes. Its user may make each elsewhere."""
+    for file, text in {
+        "/run/forbidden.py": Path(forbidden.__file__).read_text(),
+        f"/run/systemd/system/{UNIT}.d/execute.conf": DROP_IN,
+    }.items():
+        robot.shell.run(["sudo", "install", "-D", "/dev/stdin", file], stdin=text)
+    try:
+        elsewhere = json.loads(
+            sh(robot, "setpriv --reuid=control --regid=control --clear-groups python3 /run/forbidden.py")
+        )
+        sh(robot, f"systemctl daemon-reload; systemctl start {UNIT}")
+        assert json.loads(sh(robot, "cat /run/forbidden.json")) == []
+        assert len(elsewhere) == 6, elsewhere
+    finally:
+        sh(robot, f"rm -r /run/forbidden* /run/systemd/system/{UNIT}.d; systemctl daemon-reload")
