@@ -14,7 +14,6 @@ IO_PORTS = """\
 [Service]
 AmbientCapabilities=CAP_SYS_RAWIO
 CapabilityBoundingSet=CAP_SYS_RAWIO
-SystemCallFilter=@raw-io
 """
 
 

@@ -42,24 +42,21 @@ ExecStart=/usr/bin/python3 {directory}/measure.py {directory}/plan.json /dev/{tt
 StandardError=tty
 TTYPath=/dev/{console}
 """
-FIRST_STEP = """# A control task's service, but for what it executes.
+FIRST_STEP = """[Unit]
+Description=First period of a real-time thread
+DefaultDependencies=no
+
 [Service]
-Type=exec
-ExecStart=
-ExecStart={directory}/first_step
-ExecStopPost=
-Restart=no
-WatchdogSec=0
+Nice=-20
 CPUSchedulingPolicy=fifo
 CPUSchedulingPriority=90
-StandardOutput=truncate:/run/first-step
+StandardOutput=null
 StandardError=null
+ExecStart={directory}/first_step /run/first-step
 """
-UNITS = {
-    "latency.service": (UNIT, "", "multi-user.target"),
-    "flotilla-task@first-step.service": (FIRST_STEP, ".d/execute.conf", "sysinit.target"),
-}
-"""With what their file is named beyond the unit, and with the target that wants them."""
+"""Ordered as a control task may be at the earliest: ARCHITECTURE.md says what it finds then."""
+UNITS = {"latency": (UNIT, "multi-user.target"), "first-step": (FIRST_STEP, "sysinit.target")}
+"""With the target that wants them."""
 DIRECTORY = PurePosixPath("/run/latency")
 """Of the measurement's own files in the guest."""
 _LINKS = {f"bin/{name}": "busybox" for name in _APPLETS.split()} | {
@@ -121,9 +118,9 @@ def units(board: Board, directory: PurePosixPath, *, modules: bool = True) -> di
     """The measurement's units and the drop-ins that start them, by their names below `systemd/system`."""
     tty, console = board.ports[machine.results_port(board, modules=modules)].tty, board.console.tty
     files = {}
-    for name, (text, beyond, target) in UNITS.items():
-        files[f"{name}{beyond}"] = text.format(directory=directory, tty=tty, console=console).encode()
-        files[f"{target}.d/{name}.conf"] = f"[Unit]\nWants={name}\n".encode()
+    for name, (text, target) in UNITS.items():
+        files[f"{name}.service"] = text.format(directory=directory, tty=tty, console=console).encode()
+        files[f"{target}.d/{name}.conf"] = f"[Unit]\nWants={name}.service\n".encode()
     return files
 
 
