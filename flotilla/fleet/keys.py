@@ -98,8 +98,7 @@ def host_keys(fleet: Fleet) -> dict[str, str]:
 
 def revoked() -> list[str]:
     """Public host keys that nobody accepts, whoever has them."""
-    file = _revoked()
-    return [" ".join(line.split()[:2]) for line in file.read_text().splitlines()] if file.exists() else []
+    return listed(_revoked())
 
 
 def revocations() -> Counter[str]:
@@ -140,6 +139,11 @@ def _retired(robot: Robot) -> Path:
 
 def _revoked() -> Path:
     return paths.KEYS / "revoked_keys"
+
+
+def listed(file: Path) -> list[str]:
+    """Public keys of a file that has one a line, each with a name; none where there is no file."""
+    return [" ".join(line.split()[:2]) for line in file.read_text().splitlines()] if file.exists() else []
 
 
 # --- the operator's key ---

@@ -75,7 +75,7 @@ def admit(fleet: Fleet, name: str, key_file: Path, days: int, out: Path | None) 
     keys.host_keys(fleet)  # with what pins them
     with keys.alone():
         before = _admissions()
-        _check(name, key_file, key, now)
+        _check(before, name, key_file, key, now)
         serial = 1 + max((each.serial for each in before), default=0)
         admission = Admission(name, serial, key, now + timedelta(days=days))
         certificate = _certificate(key_file, admission)
@@ -100,8 +100,7 @@ def revoke(name: str) -> None:
 
 def revoked() -> list[str]:
     """Public keys that robots refuse, whatever certificate there is for them."""
-    file = _revoked()
-    return [" ".join(line.split()[:2]) for line in file.read_text().splitlines()] if file.exists() else []
+    return keys.listed(_revoked())
 
 
 def table() -> str:
@@ -122,7 +121,7 @@ def shown(until: datetime) -> str:
     return f"{until:%Y-%m-%d %H:%M} UTC"
 
 
-def _check(name: str, file: Path, key: str, now: datetime) -> None:
+def _check(admissions: list[Admission], name: str, file: Path, key: str, now: datetime) -> None:
     """UserError where a certificate for the key would be useless or dangerous."""
     shown_file, refused = paths.shown(file), revoked()
     if key in {keys.public(public.with_suffix("")) for public in paths.KEYS.glob("*.pub")}:
@@ -130,7 +129,7 @@ def _check(name: str, file: Path, key: str, now: datetime) -> None:
         raise UserError(f"{shown_file}: is a key of {paths.shown(paths.KEYS)}; take one of {name}'s own")
     if key in refused:
         raise UserError(f"{shown_file}: this key was revoked, and robots refuse it; {name} needs a new one")
-    for each in _admissions():
+    for each in admissions:
         if each.key == key and each.name != name:
             raise UserError(f"{shown_file}: is the key of {each.name}, who was admitted; {name} needs one of their own")
         if each.name == name and each.key not in {key, *refused} and each.until > now:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import pty
 import re
 import shutil
 import stat
@@ -21,22 +19,9 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import identity, key_backup, keys
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.robot import operator_key, ssh
+from tests import terminal
 
-
-@pytest.fixture(scope="module")
-def made(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys as they are made first."""
-    directory = tmp_path_factory.mktemp("made") / "keys"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paths, "KEYS", directory)
-        identity.render(fleet, fleet.robots[3])
-    return directory
-
-
-@pytest.fixture(autouse=True)
-def _keys(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shutil.copytree(made, tmp_path / "keys")
-    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+pytestmark = pytest.mark.usefixtures("own_keys")
 
 
 def content() -> dict[str, bytes]:
@@ -267,24 +252,8 @@ def test_a_backup_that_fails_leaves_the_last_good_one(tmp_path: Path) -> None:
 def test_the_passphrase_is_asked_on_the_terminal(tmp_path: Path, password: Path) -> None:
     """Twice, and not shown."""
     out = tmp_path / "keys.backup"
-    environment = os.environ | {"KEYS": str(paths.KEYS)}
-    ours, theirs = pty.openpty()
-    asked = subprocess.Popen(
-        [sys.executable, "-m", "flotilla", "backup-keys", str(out)], cwd=paths.PROJECT, env=environment,
-        stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
-        preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),  # which makes it the session's terminal
-    )  # fmt: skip
-    os.close(theirs)
-    said = ""
-    for question in ("New Vault password", "Confirm New Vault password"):
-        while not re.search(rf"\n?{question}[^\n]*: ", said):
-            said += os.read(ours, 4096).decode()
-        os.write(ours, b"correct horse\n")
-    with contextlib.suppress(OSError):  # nobody has the other end any more
-        while more := os.read(ours, 4096):
-            said += more.decode()
-    os.close(ours)
-    assert asked.wait() == 0, said
+    questions = (r"\n?New Vault password[^\n]*: ", r"\n?Confirm New Vault password[^\n]*: ")
+    said = terminal.answered(["backup-keys", str(out)], dict.fromkeys(questions, "correct horse"))
     assert "encrypted" in said
     assert "horse" not in said
     shutil.rmtree(paths.KEYS)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import pty
 import re
 import shutil
 import subprocess
@@ -20,23 +18,16 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity, key_backup, keys, operators
 from flotilla.fleet.model import Fleet
+from tests import terminal
 
 NOW = datetime(2026, 11, 26, 12, 30, 45, tzinfo=UTC)
 
 
-@pytest.fixture(scope="module")
-def made(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("made") / "keys"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paths, "KEYS", directory)
-        identity.render(fleet, fleet.robots[3])
-    return directory
+pytestmark = pytest.mark.usefixtures("own_keys")
 
 
 @pytest.fixture(autouse=True)
-def _keys(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shutil.copytree(made, tmp_path / "keys")
-    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+def _now_and_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paths, "OPERATORS", tmp_path / "operators")
     monkeypatch.setattr(operators, "_now", lambda: NOW)
 
@@ -324,23 +315,8 @@ def test_the_authoritys_passphrase_is_asked_on_the_terminal(alice: Path, tmp_pat
     """Seen to fail with ssh-keygen in a session of its own."""
     argv = ["ssh-keygen", "-q", "-p", "-N", "correct horse", "-f", str(operators.authority())]
     subprocess.run(argv, check=True, capture_output=True)
-    ours, theirs = pty.openpty()
-    asked = subprocess.Popen(
-        [sys.executable, "-m", "flotilla", "admit-operator", "alice", str(alice), "--out", str(tmp_path / "out")],
-        cwd=paths.PROJECT, env=os.environ | {"KEYS": str(paths.KEYS)}, stdin=theirs, stdout=theirs, stderr=theirs,
-        start_new_session=True,
-        preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),  # which makes it the session's terminal
-    )  # fmt: skip
-    os.close(theirs)
-    said = ""
-    with contextlib.suppress(OSError):  # nobody has the other end any more
-        while "Enter passphrase" not in said:
-            said += os.read(ours, 4096).decode()
-        os.write(ours, b"correct horse\n")
-        while more := os.read(ours, 4096):
-            said += more.decode()
-    os.close(ours)
-    assert asked.wait() == 0, said
+    arguments = ["admit-operator", "alice", str(alice), "--out", str(tmp_path / "out")]
+    terminal.answered(arguments, {"Enter passphrase": "correct horse"})
     assert (tmp_path / "out" / operators.CERTIFICATE).exists()
 
 

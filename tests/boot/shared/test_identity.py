@@ -52,15 +52,24 @@ def test_host_key_is_the_pinned_one(robot: RobotGuest, tmp_path: Path) -> None:
     assert _ssh(robot, "echo in").stdout == "in\n"
 
 
-def test_nobody_else_gets_in(robot: RobotGuest, tmp_path: Path) -> None:
+@pytest.fixture
+def stranger(tmp_path: Path) -> Path:
+    """The private key of somebody whom nobody has admitted yet."""
+    return _key(tmp_path / "alice")
+
+
+def _key(private: Path) -> Path:
+    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(private)], check=True)
+    return private
+
+
+def test_nobody_else_gets_in(robot: RobotGuest, stranger: Path) -> None:
     as_root = _ssh(robot, "true", User="root")
     assert as_root.returncode == 255, f"root was let in: {as_root}"
     assert "Permission denied (publickey)" in as_root.stderr, as_root.stderr
-    key = tmp_path / "key"
-    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
-    stranger = _ssh(robot, "true", IdentityFile=str(key))
+    refused = _ssh(robot, "true", IdentityFile=str(stranger))
     # The only method named is the one offered: passwords are not asked for.
-    assert "Permission denied (publickey)" in stranger.stderr, f"a strange key: {stranger}"
+    assert "Permission denied (publickey)" in refused.stderr, f"a strange key: {refused}"
 
 
 def _sign(key: Path, authority: Path, principal: str, valid: str) -> Path:
@@ -74,13 +83,6 @@ def _gets_in(robot: RobotGuest, key: Path, certificate: Path) -> bool:
     done = _ssh(robot, "sudo -n id -u", IdentityFile=str(key), CertificateFile=str(certificate))
     assert done.stdout == "0\n" or "Permission denied (publickey)" in done.stderr, f"neither in nor refused: {done}"
     return done.returncode == 0
-
-
-@pytest.fixture
-def stranger(tmp_path: Path) -> Path:
-    """The private key of somebody whom nobody has admitted yet."""
-    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(tmp_path / "alice")], check=True)
-    return tmp_path / "alice"
 
 
 def test_who_has_a_certificate_gets_in_until_it_is_revoked(
@@ -107,8 +109,7 @@ def test_who_has_a_certificate_gets_in_until_it_is_revoked(
 def test_a_certificate_that_has_ended_or_is_not_for_robots_is_refused(
     robot: RobotGuest, stranger: Path, tmp_path: Path
 ) -> None:
-    authority, another = operators.authority(), tmp_path / "another"
-    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(another)], check=True)
+    authority, another = operators.authority(), _key(tmp_path / "another")
     assert _gets_in(robot, stranger, _sign(stranger, authority, "robot", "always:forever"))
     assert not _gets_in(robot, stranger, _sign(stranger, another, "robot", "always:forever")), "of another authority"
     assert not _gets_in(robot, stranger, _sign(stranger, authority, "root", "always:forever")), "for another user"
