@@ -166,6 +166,14 @@ class Flight:
             found.append(f"four hops: {late}, {whole.max_us} µs at most")
         return found
 
+    def overruns(self, task: str) -> int:
+        """Of a task. Those before the path is flown, while programs start, are left out where it had none since."""
+        found = self.statistics[task]
+        last = found.get("last_overrun")
+        begin_ns = self.commanded[0]["time_ns"] if self.commanded else 0
+        counted: int = found["overruns"]
+        return 0 if last and last["at_ns"] < begin_ns else counted
+
     def lost(self) -> int:
         """Of the robot's steps in flight, from the first whose command arrived to the last: those whose did not."""
         numbers: list[int] = [step["number"] for step in self.in_flight]

@@ -102,7 +102,7 @@ def summary(flight: Flight) -> dict[str, object]:
         jitters = [each["jitter"]["max_ns"] for each in flight.statistics.values() if "jitter" in each]
         if len(jitters) == len(flight.statistics):  # a service of the image counts steps, and measures no jitter
             found["jitter_max_us"] = max(jitters) / 1000
-        found["overruns"] = sum(each["overruns"] for each in flight.statistics.values())
+        found["overruns"] = sum(flight.overruns(task) for task in flight.statistics)
     if flight.completed:
         error, thrusters = flight.error(), flight.thrusters()
         found |= {

@@ -522,8 +522,15 @@ void executive_write_statistics(const struct task *task, const struct run_result
 {
     fprintf(out, "{\"task\": \"%s\", \"period_ns\": %" PRId64 ", \"steps\": %" PRIu64, task->name, task->period_ns,
             result->steps);
-    fprintf(out, ", \"overruns\": %" PRIu64 ", \"skipped\": %" PRIu64 ", \"timeouts\": %" PRIu64 ",\n \"jitter\": ",
+    fprintf(out, ", \"overruns\": %" PRIu64 ", \"skipped\": %" PRIu64 ", \"timeouts\": %" PRIu64 ", \"last_overrun\": ",
             result->overruns, result->skipped, result->timeouts);
+    const struct overrun_of_step *last = &result->last_overrun;
+    if (result->overruns)
+        fprintf(out, "{\"step\": %" PRIu64 ", \"at_ns\": %" PRId64 ", \"late_ns\": %" PRId64 "}", last->step,
+                last->at_ns, last->late_ns);
+    else
+        fputs("null", out);
+    fprintf(out, ",\n \"jitter\": ");
     statistics_write(&result->jitter, out);
     fprintf(out, ",\n \"step\": ");
     statistics_write(&result->step, out);

@@ -20,7 +20,8 @@ void executive_run(struct task *task, const struct run_options *options, struct 
  * holds after a second is left as it is. Returns the number of failures. */
 unsigned executive_make_safe(struct task *task);
 
-/* Steps, overruns and times of task and blocks as JSON. */
+/* Steps, overruns and times of task and blocks as JSON. `last_overrun` is null where there was none; its `step` ended
+ * at `at_ns` of CLOCK_MONOTONIC, `late_ns` after the next one was due. */
 void executive_write_statistics(const struct task *task, const struct run_result *result, FILE *out);
 
 #endif

@@ -31,7 +31,9 @@ VALVES_OPEN_S = 2 * 8 * 10.5 * 0.01 / 0.16
 """Of all valves: twice what starting, turning at corners and stopping take, eight changes of a velocity by 1 cm/s."""
 PUBLISHED_VALVES_OPEN_S = 33
 """Over the published square, which is for the most part keeping to its sides: the trial's."""
-FIRINGS_PER_S = 4
+FIRINGS_PER_S = 5
+"""Between chance and a fault: two images of the same parts differ in where these lie in memory, and so by a factor of
+two in firings, up to 49 in 12 s; arms of 10 cm lead to 103 and more."""
 DIVIDED = {"disorder": 2}
 """By flight, into how many firings a pulse may fall: a command that is late leaves the valve closed in between."""
 
@@ -164,7 +166,7 @@ def test_over_the_air_every_step_is_flown(flights: Callable[[str], Flight], sess
 def steps_are_flown(name: str, flight: Flight, overruns: int = 0, lost: float = 0) -> None:
     print(f"{name}: percentiles of four hops {flight.latency().percentiles_us} µs")
     print(f"{name}: {flight.late()} of {flight.latency().samples} above the limit; lost {flight.lost()}")
-    overran = {task: flight.statistics[task]["overruns"] for task in CONTROL_TASKS}
+    overran = {task: flight.overruns(task) for task in CONTROL_TASKS}
     print(f"{name}: overruns {overran}")
     assert flight.lost() <= lost * flight.latency().samples
     assert sum(overran.values()) <= overruns
@@ -323,9 +325,9 @@ def test_forged_and_replayed_commands_are_refused_and_counted(flights: Callable[
     last = flight.steps[-1]
     print(f"forged {last['forged']}, replayed {last['replayed']}; lost {flight.lost()}")
     assert last["forged"] > 1.8 * last["replayed"] > 0.2 * len(flight.steps)
-    for record in flights("udp").steps:
-        assert record["forged"] == 0
-        assert record["replayed"] <= 1  # the first message of all, before the robots knew each other
+    assert {record["forged"] for record in flights("udp").steps} == {0}
+    replayed = {record["replayed"] for record in flights("udp").in_flight}
+    assert len(replayed) == 1, "more than the first messages of all, before the robots knew each other"
 
 
 def test_a_second_station_hears_the_same_and_disturbs_nobody(flights: Callable[[str], Flight]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,7 @@ def test_steps_are_counted_and_timed(tasks: Tasks) -> None:
     counted = ended.statistics
     assert counted["steps"] == 100 == counted["step"]["count"] == counted["jitter"]["count"]
     assert (counted["blocks"]["a"]["count"], counted["blocks"]["b"]["count"]) == (100, 25)
+    assert counted["last_overrun"] is None or counted["overruns"]
     assert 0 <= counted["step"]["min_ns"] <= counted["step"]["mean_ns"] <= counted["step"]["max_ns"]
 
 
@@ -69,6 +71,8 @@ def test_what_a_block_took_is_in_nanoseconds(tasks: Tasks) -> None:
     )
     counted = tasks.run(task(late, "period: 10 ms\noverruns: 0"), "--steps", "5").statistics
     bad, quick, step = counted["blocks"]["bad"], counted["blocks"]["quick"], counted["step"]
+    assert counted["last_overrun"]["step"] == 4
+    assert counted["last_overrun"]["late_ns"] >= 25e6
     assert 35e6 <= bad["mean_ns"] <= bad["max_ns"]
     assert bad["mean_ns"] + quick["mean_ns"] <= 1.001 * step["mean_ns"]
     assert max(bad["max_ns"], quick["max_ns"]) <= 1.001 * step["max_ns"]
@@ -77,7 +81,9 @@ def test_what_a_block_took_is_in_nanoseconds(tasks: Tasks) -> None:
 def test_overruns_are_left_out_or_caught_up_with(tasks: Tasks) -> None:
     """A computer that stands still for half a second does not change it: ten periods can be caught up with."""
     late = "bad: {type: misbehave, parameters: {manner: late, from: 3, until: 5, late_s: 0.25}}"
+    began_ns = time.monotonic_ns()
     skipping = tasks.run(task(late, "period: 100 ms\noverruns: 0"), "--steps", "12").statistics
+    assert began_ns < skipping["last_overrun"]["at_ns"] < time.monotonic_ns()
     assert skipping["overruns"] >= 2
     assert skipping["skipped"] >= 4
     catching_up = tasks.run(task(late, "period: 100 ms\noverrun: catch-up\noverruns: 0"), "--steps", "12").statistics
