@@ -14,6 +14,7 @@ IO_PORTS = """\
 [Service]
 AmbientCapabilities=CAP_SYS_RAWIO
 CapabilityBoundingSet=CAP_SYS_RAWIO
+SystemCallFilter=@raw-io
 """
 
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 STATION = "station"
-RECEIVER = Path("/run/systemd/system/flotilla-receive.service.d/course.conf")
 UPDATER = Path("/run/update")
 FLOTILLA = "/usr/lib/flotilla"
 DATA = Path("/data/update")
@@ -124,22 +123,19 @@ class Task:
         return said | {"statistics": json.loads(file.read_text()) if file.exists() else None}
 
 
-def scheduling(name: str) -> str:
-    """How a service runs, in the kernel's words."""
-    return run("chrt", "-p", run("systemctl", "show", "--property=MainPID", "--value", name).strip())
+def scheduling(name: str, priority: int) -> str:
+    """How a service runs, in the kernel's words; `priority`: a real-time one that it gets first, 0: as it was started.
 
-
-def receiver_above(priority: int) -> None:
-    """Give the receiver's service a real-time priority; 0: as it is shipped."""
-    more = f"CPUSchedulingPolicy=fifo\nCPUSchedulingPriority={priority}\n" if priority else ""
-    RECEIVER.parent.mkdir(parents=True, exist_ok=True)
-    RECEIVER.write_text(f"[Service]\n{more}")
-    run("systemctl", "daemon-reload")
+    It was started without: what the service manager does for that takes longer than a task may wait.
+    """
+    process = run("systemctl", "show", "--property=MainPID", "--value", name).strip()
+    if priority:
+        run("chrt", "--fifo", "--pid", str(priority), process)
+    return run("chrt", "-p", process)
 
 
 def course(name: str, session: dict[str, Any], above: dict[str, int], out: Path) -> dict[str, Any]:
     """A release comes while the task runs. `above`: real-time priorities of `receiver` and `updater`; 0: as shipped."""
-    receiver_above(above["receiver"])
     device = card(name, session, above["updater"])
     update = str(UPDATER / "update.py")
     task = Task(session, out / name, session["task"])
@@ -149,7 +145,7 @@ def course(name: str, session: dict[str, Any], above: dict[str, int], out: Path)
     told["begun"] = task.now()
     description = Path(session["description"]).read_bytes()
     run(f"{FLOTILLA}/receive", "begin", session["station"], session["robot"], given=description)
-    told["scheduling"] = scheduling("flotilla-receive")
+    told["scheduling"] = scheduling("flotilla-receive", above["receiver"])
     sender = ["ip", "netns", "exec", STATION, "python3", session["sender"], session["tape"], session["station"]]
     told["answers"] = json.loads(run(*sender, str(session["bit_s"])))
     told["received"] = task.now()

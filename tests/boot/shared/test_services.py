@@ -1,0 +1,63 @@
+"""Services that other people's bytes or code reach: what each could do if somebody took it over."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from tests.boot.guests import sh
+from tests.boot.shared.probes import forbidden
+from tests.conftest import RobotGuest
+
+EXPOSURE = {"flotilla-task@any.service": 3.4, "flotilla-app@any.service": 3.4, "flotilla-receive.service": 3.8}
+"""At most, by `systemd-analyze security`: 0 could do nothing, 10 anything. What the rest would cost stands in
+docs/decisions/0079-system-calls-of-services.md."""
+
+
+def _exposure(robot: RobotGuest, *units: str) -> dict[str, float]:
+    said = sh(robot, f"systemd-analyze security --no-pager {' '.join(units)} | grep 'Overall exposure'")
+    return {unit: float(level) for unit, level in re.findall(r"level for (\S+): ([0-9.]+)", said)}
+
+
+def test_what_may_be_taken_over_has_few_rights(robot: RobotGuest) -> None:
+    """Seen to fail without restrictions of system calls: tasks had 6.4."""
+    found = _exposure(robot, *EXPOSURE)
+    print(found)
+    assert set(found) == set(EXPOSURE)
+    exposed = {unit: level for unit, level in found.items() if level > EXPOSURE[unit]}
+    assert not exposed, exposed
+    assert _exposure(robot, "cron.service")["cron.service"] > 9, "the figures tell services apart"
+
+
+UNIT = "flotilla-task@forbidden.service"
+DROP_IN = """[Service]
+Type=oneshot
+ExecStart=
+ExecStart=/usr/bin/python3 /run/forbidden.py
+ExecStopPost=
+Restart=no
+WatchdogSec=0
+StandardOutput=truncate:/run/forbidden.json
+"""
+
+
+def test_a_control_task_makes_no_system_call_that_it_does_not_need(robot: RobotGuest) -> None:
+    """In a control task's own service, but for what that executes. Its user may make each elsewhere.
+
+    Seen to fail without restrictions of system calls: each call but one succeeded.
+    """
+    for file, text in {
+        "/run/forbidden.py": Path(forbidden.__file__).read_text(),
+        f"/run/systemd/system/{UNIT}.d/execute.conf": DROP_IN,
+    }.items():
+        robot.shell.run(["sudo", "install", "-D", "/dev/stdin", file], stdin=text)
+    try:
+        elsewhere = json.loads(
+            sh(robot, "setpriv --reuid=control --regid=control --clear-groups python3 /run/forbidden.py")
+        )
+        sh(robot, f"systemctl daemon-reload; systemctl start {UNIT}")
+        assert json.loads(sh(robot, "cat /run/forbidden.json")) == []
+        assert len(elsewhere) == 6, elsewhere
+    finally:
+        sh(robot, f"rm -r /run/forbidden* /run/systemd/system/{UNIT}.d; systemctl daemon-reload")
