@@ -20,8 +20,9 @@ from lab.staging import virtual
 from lab.staging.virtual import ALONE, BAD, RECEIVER, SHIPPED, UPDATER, Staged
 from tests.figures import PROPERTY
 
-JITTER_NS = 80_000
-"""Of the task, at most, while a release comes: 74 µs was measured, and 64 µs without one."""
+JITTER_NS = 100_000
+"""Of the task, at most, while a release comes: the published limit. Images that differ in nothing but the length of a
+comment had 69 to 79 µs, two of twelve 98 and 101; without a release, 56 to 69."""
 PERIOD_S = 0.01
 ANSWER = struct.Struct("!LHHLH")
 """Transfer, kind, question, symbols received, blocks that lack some; then for each its number and how many it lacks."""

@@ -10,7 +10,7 @@ from tests.boot.guests import sh
 from tests.boot.shared.probes import forbidden
 from tests.conftest import RobotGuest
 
-EXPOSURE = {"flotilla-task@any.service": 3.4, "flotilla-app@any.service": 3.4, "flotilla-receive.service": 3.8}
+EXPOSURE = {"flotilla-task@any.service": 3.4, "flotilla-app@any.service": 3.4}
 """At most, by `systemd-analyze security`: 0 could do nothing, 10 anything. What the rest would cost stands in
 docs/decisions/0079-system-calls-of-services.md."""
 
