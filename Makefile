@@ -130,8 +130,8 @@ rotate-key: | setup ## a new key for a robot or the operator: make rotate-key RO
 revoke-key: | setup ## refuse the host key of a robot that is in other hands: make revoke-key ROBOT=3, then provision the others
 	$(Q)$(FLOTILLA) revoke-key $(call need,ROBOT)
 
-admit-operator: | setup ## let a person into all robots for some days: make admit-operator NAME=alice KEY_FILE=alice.pub [DAYS=30] [OUT=directory]
-	$(Q)$(FLOTILLA) admit-operator $(call option,--days,DAYS) $(call option,--out,OUT) -- $(call need,NAME) $(call need,KEY_FILE)
+admit-operator: | setup ## let a person into all robots for some days: make admit-operator NAME=alice KEY_FILE=alice.pub [DAYS=30] [FROM=addresses] [OUT=directory]
+	$(Q)$(FLOTILLA) admit-operator $(call option,--days,DAYS) $(call option,--from,FROM) $(call option,--out,OUT) -- $(call need,NAME) $(call need,KEY_FILE)
 
 revoke-operator: | setup ## refuse a person's certificates: make revoke-operator NAME=alice, then provision
 	$(Q)$(FLOTILLA) revoke-operator $(call need,NAME)

@@ -250,7 +250,8 @@ def _admit_operator(arguments: argparse.Namespace) -> None:
     from flotilla.fleet import inventory, operators
 
     fleet = inventory.load_fleet()
-    folder, admission = operators.admit(fleet, arguments.name, arguments.key_file, arguments.days, arguments.out)
+    given = (arguments.name, arguments.key_file, arguments.days, arguments.out, arguments.sources)
+    folder, admission = operators.admit(fleet, *given)
     print(
         f"{paths.shown(folder)}: a certificate for {admission.name} until {operators.shown(admission.until)}, and "
         f"known_hosts; from that folder, with the key's private half: ssh -i KEY -o "
@@ -264,6 +265,13 @@ def _admit_operator_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", help="of the person: small letters, digits and hyphens")
     parser.add_argument("key_file", type=Path, help="the person's public key")
     parser.add_argument("--days", type=int, default=operators.DAYS, help="how long the certificate lasts (%(default)s)")
+    parser.add_argument(
+        "--from",
+        dest="sources",
+        default="",
+        metavar="ADDRESSES",
+        help="addresses or networks, commas between, from which alone robots take it",
+    )
     parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where to (build/operators/NAME)")
 
 

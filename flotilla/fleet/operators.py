@@ -21,6 +21,7 @@ import subprocess
 import tempfile
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from ipaddress import IPv4Network
 from pathlib import Path
 
 from flotilla.common import paths
@@ -48,6 +49,8 @@ class Admission:
     key: str
     """The person's public key, without comment."""
     until: datetime
+    sources: tuple[str, ...] = ()
+    """Networks from which robots take it; empty: from anywhere."""
 
 
 def authority() -> Path:
@@ -55,9 +58,12 @@ def authority() -> Path:
     return keys.make("operator_authority", "authority of operators")
 
 
-def admit(fleet: Fleet, name: str, key_file: Path, days: int, out: Path | None) -> tuple[Path, Admission]:
+def admit(
+    fleet: Fleet, name: str, key_file: Path, days: int, out: Path | None, sources: str = ""
+) -> tuple[Path, Admission]:
     """Sign a certificate for the public key in a file, and write it beside the `known_hosts` that pins all robots.
 
+    `sources`: addresses and networks, with commas between, from which alone robots take it; empty: from anywhere.
     Returns their folder. The list of admissions has the certificate before anybody can use it, so that whatever was
     handed out can be revoked.
     """
@@ -65,6 +71,7 @@ def admit(fleet: Fleet, name: str, key_file: Path, days: int, out: Path | None) 
         raise UserError(f"NAME={name}: is no name; take small letters, digits and hyphens, a letter first")
     if not 1 <= days <= _MOST_DAYS:
         raise UserError(f"DAYS={days}: take 1 to {_MOST_DAYS}; a certificate is renewed by the same command")
+    networks = _networks(fleet, sources)
     key, now = _public_key(key_file), _now()
     folder = out or paths.OPERATORS / name
     try:
@@ -77,7 +84,7 @@ def admit(fleet: Fleet, name: str, key_file: Path, days: int, out: Path | None) 
         before = _admissions()
         _check(before, name, key_file, key, now)
         serial = 1 + max((each.serial for each in before), default=0)
-        admission = Admission(name, serial, key, now + timedelta(days=days))
+        admission = Admission(name, serial, key, now + timedelta(days=days), networks)
         certificate = _certificate(key_file, admission)
         _record([*before, admission])
     keys.write(folder / "known_hosts", (paths.KEYS / "known_hosts").read_text())
@@ -112,8 +119,9 @@ def table() -> str:
     width = max((len(name) for name, _ in last), default=0)
     lines = []
     for (name, key), each in sorted(last.items()):
-        state = "revoked" if key in refused else "expired" if each.until <= now else ""
-        lines.append(f"{name:{width}}  until {shown(each.until)}  {state}".rstrip())
+        state = ["revoked"] if key in refused else ["expired"] if each.until <= now else []
+        where = [f"from {', '.join(each.sources)}"] if each.sources else []
+        lines.append("  ".join([f"{name:{width}}", f"until {shown(each.until)}", *where, *state]))
     return "\n".join(lines) or "no operator was admitted by a certificate; `make admit-operator` does so"
 
 
@@ -137,6 +145,25 @@ def _check(admissions: list[Admission], name: str, file: Path, key: str, now: da
                 f"NAME={name}: is admitted with another key until {shown(each.until)}; "
                 f"`make revoke-operator NAME={name}` first, or take another name"
             )
+
+
+def _networks(fleet: Fleet, sources: str) -> tuple[str, ...]:
+    """As written, each in its shortest form."""
+    subnet = fleet.network.subnet
+    found = []
+    for source in filter(None, sources.split(",")):
+        try:
+            network = IPv4Network(source)
+        except ValueError as error:
+            raise UserError(
+                f"FROM={sources}: {error}; take addresses, or networks as 10.0.0.0/24, commas between"
+            ) from error
+        if not network.overlaps(subnet):
+            raise UserError(
+                f"FROM={sources}: {source} is outside of {subnet}, and nobody reaches a robot from elsewhere"
+            )
+        found.append(str(network).removesuffix("/32"))
+    return tuple(found)
 
 
 def _public_key(file: Path) -> str:
@@ -168,7 +195,10 @@ def _certificate(key_file: Path, admission: Admission) -> str:
         public = Path(directory) / "key.pub"
         public.write_text(f"{admission.key} {admission.name}\n")
         argv = ["ssh-keygen", "-q", "-s", str(authority()), "-I", admission.name, "-n", _PRINCIPAL, "-V", valid]
-        argv += ["-z", str(admission.serial), "-O", "clear", "-O", "permit-pty", str(public)]
+        argv += ["-z", str(admission.serial), "-O", "clear", "-O", "permit-pty"]
+        if admission.sources:
+            argv += ["-O", f"source-address={','.join(admission.sources)}"]
+        argv.append(str(public))
         # ssh-keygen reads times as local ones; only newer ones know the suffix for UTC.
         done = subprocess.run(
             argv, env=os.environ | {"TZ": "UTC"}, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
@@ -186,7 +216,11 @@ def _admissions() -> list[Admission]:
     try:
         return [
             Admission(
-                each["name"], each["serial"], each["key"], datetime.strptime(each["until"], _TIME).replace(tzinfo=UTC)
+                each["name"],
+                each["serial"],
+                each["key"],
+                datetime.strptime(each["until"], _TIME).replace(tzinfo=UTC),
+                tuple(each["sources"]),
             )
             for each in json.loads(file.read_text())
         ]

@@ -48,6 +48,7 @@ ELSEWHERE = {
         (
             "make admit-operator NAME=alice KEY_FILE=alice.pub",
             "make admit-operator NAME=alice KEY_FILE=alice.pub DAYS=7 OUT=alice",
+            "make admit-operator NAME=alice KEY_FILE=alice.pub FROM=10.42.0.100,10.42.0.128/28",
             "make revoke-operator NAME=alice",
         ),
         "needs a colleague's key, and changes the keys; unit/test_operators.py does the same with a copy",

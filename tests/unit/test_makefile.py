@@ -35,7 +35,7 @@ GIVEN = {
     "deploy": ["ROBOT", "APP", "RUN"],
     "rotate-key": ["KEY"],
     "revoke-key": ["ROBOT"],
-    "admit-operator": ["NAME", "KEY_FILE", "DAYS", "OUT"],
+    "admit-operator": ["NAME", "KEY_FILE", "DAYS", "FROM", "OUT"],
     "revoke-operator": ["NAME"],
     "backup-keys": ["OUT", "PASSWORD_FILE"],
     "restore-keys": ["FILE", "PASSWORD_FILE"],

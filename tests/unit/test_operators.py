@@ -119,6 +119,33 @@ def test_a_name_is_a_simple_word(fleet: Fleet, alice: Path, name: str) -> None:
         admit(fleet, name, alice)
 
 
+def test_a_certificate_may_be_for_some_addresses_alone(fleet: Fleet, alice: Path) -> None:
+    """Within the robots' network; `make operators` shows them."""
+    folder, _ = operators.admit(fleet, "alice", alice, 30, None, "10.42.0.100,10.42.0.128/28,10.42.0.101/32")
+    options = described(folder / operators.CERTIFICATE).partition("Critical Options:")[2].partition("Extensions:")[0]
+    assert options.split() == ["source-address", "10.42.0.100,10.42.0.128/28,10.42.0.101"]
+    shown = "alice  until 2026-12-26 12:30 UTC  from 10.42.0.100, 10.42.0.128/28, 10.42.0.101"
+    assert operators.table() == shown
+    operators.revoke("alice")
+    assert operators.table() == f"{shown}  revoked"
+
+
+@pytest.mark.parametrize(
+    ("sources", "problem"),
+    [
+        ("10.42.0.1/24", "10.42.0.1/24 has host bits set; take addresses, or networks as 10.0.0.0/24, commas between"),
+        ("10.42.0.0/33", "'33' is not a valid netmask"),
+        ("10.42.0.1 10.42.0.2", "Expected 4 octets in '10.42.0.1 10.42.0.2'"),
+        ("alice.local", "Expected 4 octets in 'alice.local'"),
+        ("10.42.0.1,192.168.1.0/24", "192.168.1.0/24 is outside of 10.42.0.0/24, and nobody reaches a robot"),
+    ],
+)
+def test_addresses_are_of_the_robots_network(fleet: Fleet, alice: Path, sources: str, problem: str) -> None:
+    with pytest.raises(UserError, match=rf"^FROM={re.escape(sources)}: {re.escape(problem)}"):
+        operators.admit(fleet, "alice", alice, 30, None, sources)
+    assert not (paths.KEYS / "operators").exists()
+
+
 @pytest.mark.parametrize("days", [-1, 0, 366])
 def test_days_have_limits(fleet: Fleet, alice: Path, days: int) -> None:
     with pytest.raises(UserError, match=rf"^DAYS={days}: take 1 to 365"):
@@ -323,4 +350,4 @@ def test_the_authoritys_passphrase_is_asked_on_the_terminal(alice: Path, tmp_pat
 def test_the_list_is_json(fleet: Fleet, alice: Path) -> None:
     admit(fleet, "alice", alice)
     (one,) = json.loads((paths.KEYS / "operators").read_text())
-    assert one == {"name": "alice", "serial": 1, "key": bare(alice), "until": "2026-12-26T12:30:45Z"}
+    assert one == {"name": "alice", "serial": 1, "key": bare(alice), "until": "2026-12-26T12:30:45Z", "sources": []}

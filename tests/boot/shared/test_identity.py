@@ -72,10 +72,10 @@ def test_nobody_else_gets_in(robot: RobotGuest, stranger: Path) -> None:
     assert "Permission denied (publickey)" in refused.stderr, f"a strange key: {refused}"
 
 
-def _sign(key: Path, authority: Path, principal: str, valid: str) -> Path:
+def _sign(key: Path, authority: Path, principal: str, valid: str, *options: str) -> Path:
     """A certificate for a key, as no command of ours makes it."""
-    argv = ["ssh-keygen", "-q", "-s", str(authority), "-I", "alice", "-n", principal, "-V", valid, f"{key}.pub"]
-    subprocess.run(argv, check=True)
+    argv = ["ssh-keygen", "-q", "-s", str(authority), "-I", "alice", "-n", principal, "-V", valid]
+    subprocess.run([*argv, *(f"-O{option}" for option in options), f"{key}.pub"], check=True)
     return key.with_name(f"{key.name}-cert.pub").rename(key.with_name("certificate"))
 
 
@@ -114,6 +114,14 @@ def test_a_certificate_that_has_ended_or_is_not_for_robots_is_refused(
     assert not _gets_in(robot, stranger, _sign(stranger, another, "robot", "always:forever")), "of another authority"
     assert not _gets_in(robot, stranger, _sign(stranger, authority, "root", "always:forever")), "for another user"
     assert not _gets_in(robot, stranger, _sign(stranger, authority, "robot", "20200101:20200102")), "expired"
+
+
+def test_a_certificate_for_other_addresses_is_refused(robot: RobotGuest, stranger: Path, tmp_path: Path) -> None:
+    """Seen to fail with a certificate without addresses."""
+    here = robot.shell.run(["printenv", "SSH_CONNECTION"]).stdout.split()[0]
+    authority, valid = operators.authority(), "always:forever"
+    assert _gets_in(robot, stranger, _sign(stranger, authority, "robot", valid, f"source-address={here}"))
+    assert not _gets_in(robot, stranger, _sign(stranger, authority, "robot", valid, "source-address=10.42.0.100"))
 
 
 def test_nobody_has_a_password(robot: RobotGuest) -> None:
