@@ -26,6 +26,8 @@ from images.builder.lock import Lock, read_lock
 _PACKAGES = paths.PROJECT / "images" / "bench-packages.txt"
 _RUNS = 5
 """Of what takes about a second; the median counts."""
+_MANY = 100
+"""Robots that are made at once."""
 _NO_MKOSI = (
     "mkosi: give MKOSI=… to compare: bin/mkosi in a checkout of a release of github.com/systemd/mkosi (25.3 works)"
 )
@@ -98,6 +100,7 @@ def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[R
     if others:
         title = f"{others[0].name} after {first.name}"
         rows.append(_measure(title, "bootable card", image(others[0]), _RUNS))
+    rows.append(_measure(f"{_MANY} more robots of that board", f"{_MANY} bootable cards", _many(work, first), 1))
     everyone = list(fleet.robots.values())
     boards = len({robot.board for robot in everyone})
     cards = f"{len(everyone)} bootable cards"
@@ -112,6 +115,30 @@ def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[R
 
     rows.append(_measure("cp of an image, its pages in memory", "the same bytes", copy, _RUNS))
     return rows
+
+
+def _many(work: Path, first: Robot) -> Callable[[], int]:
+    """Cards of many robots, with keys that are made for them and thrown away."""
+    images, keys, one = work / "images", work / "keys", build.image_of(first).name
+
+    def make() -> int:
+        needed = _MANY * _allocated(images / one)
+        if (free := shutil.disk_usage(work).free) < needed:
+            raise UserError(
+                f"{paths.shown(work)}: {_MANY} cards need {progress.size(needed)}, and {progress.size(free)} are free; "
+                "make room, or let BUILD= name a folder on a larger disk"
+            )
+        shutil.copytree(paths.KEYS, keys)
+        argv = [sys.executable, "-m", "images.builder.bench_robots", str(first.number), str(_MANY)]
+        _command(argv, BUILD=str(work), KEYS=str(keys))
+        made = list(images.glob("measured*.img"))
+        size = sum(map(_allocated, made))
+        cache.discard(keys)
+        for file in images.glob("measured*"):
+            file.unlink()
+        return size
+
+    return make
 
 
 def _mmdebstrap(work: Path, repository: Path, lock: Lock) -> Row:

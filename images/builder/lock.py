@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -127,7 +128,7 @@ class Lock:
         """SOURCE_DATE_EPOCH of everything made from this lock: when its newest suite was released."""
         return int(max(suite.date for suite in self.suites).timestamp())
 
-    @property
+    @functools.cached_property  # it is asked for again with each card
     def digest(self) -> str:
         """SHA-256 of the lock's text but for `checked`: names whatever is made from it."""
         return hashlib.sha256(format_lock(dataclasses.replace(self, checked=None)).encode()).hexdigest()
