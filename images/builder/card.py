@@ -190,15 +190,16 @@ def begin(base_directory: Path, out: Path) -> Extents:
         return _place(base_directory / "card.img", extents(base_directory), card.fileno(), whole)
 
 
-def complete(card: Path, data: Path, data_extents: Extents) -> Extents:
-    """Add the robot's data partition to a card that `begin` made."""
-    with card.open("r+b") as file:
-        return _place(data, data_extents, file.fileno(), DATA)
+def complete(tools: Tools, card: Path, nodes: list[Node], epoch: int) -> Extents:
+    """Add the data partition with the robot's files to a card that `begin` made."""
+    return data_partition(tools, card, nodes, epoch, DATA.start)
 
 
-def data_partition(tools: Tools, out: Path, nodes: list[Node], epoch: int) -> Extents:
-    """Write the data partition `out` with the robot's files."""
-    return filesystem.make(tools, out, DATA.size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch)
+def data_partition(tools: Tools, out: Path, nodes: list[Node], epoch: int, start: int | None = None) -> Extents:
+    """Write the data partition with the robot's files, as the file `out`, or so many bytes behind its beginning."""
+    return filesystem.make(
+        tools, out, DATA.size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch, start=start
+    )
 
 
 def _place(source: Path, extents: Extents, card: int, partition: Partition) -> Extents:

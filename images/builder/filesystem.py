@@ -37,30 +37,43 @@ class Node:
 
 
 def make(
-    tools: Tools, image: Path, size: int, nodes: list[Node], *, kind: str, label: str, uuid: str, epoch: int
+    tools: Tools,
+    image: Path,
+    size: int,
+    nodes: list[Node],
+    *,
+    kind: str,
+    label: str,
+    uuid: str,
+    epoch: int,
+    start: int | None = None,
 ) -> list[tuple[int, int]]:
-    """Make `image` of `size` bytes; return the extents (offset, length in bytes) that hold anything.
+    """Make a file system of `size` bytes; return the extents of `image` (offset, length in bytes) that hold anything.
 
-    `nodes` must name parents before children.
+    It is the new file `image`, or lies `start` bytes behind the beginning of one that exists, where there is nothing
+    yet. `nodes` must name parents before children.
     """
-    image.unlink(missing_ok=True)
+    if start is None:
+        image.unlink(missing_ok=True)
+    within = f"{image}?offset={start or 0}"
     tools.run(
         "usr/sbin/mke2fs", "-q", "-F", "-b", str(BLOCK), "-I", "256", "-i", "8192", "-m", "1", "-O", _FEATURES[kind],
         "-L", label, "-U", uuid,
-        "-E", f"hash_seed={uuid},lazy_itable_init=0,lazy_journal_init=0,nodiscard,root_owner=0:0",
+        "-E", f"hash_seed={uuid},lazy_itable_init=0,lazy_journal_init=0,nodiscard,root_owner=0:0,offset={start or 0}",
         image, str(size // BLOCK),
     )  # fmt: skip
     with tempfile.TemporaryDirectory(dir=image.parent) as directory:
         script = Path(directory) / "script"
         script.write_text("".join(_commands(nodes, Path(directory), epoch)))
-        answer = tools.run("usr/sbin/debugfs", "-w", "-f", script, image)
+        answer = tools.run("usr/sbin/debugfs", "-w", "-f", script, within)
     mistakes = [
         line for line in answer.splitlines() if not line.startswith(("debugfs: ", "Allocated inode: ", "debugfs 1."))
     ]
     if mistakes:
         raise UserError(f"cannot write {label} file system: " + "; ".join(mistakes))
-    tools.run("usr/sbin/e2fsck", "-f", "-n", image)
-    return _used(tools.run("usr/sbin/dumpe2fs", image), size)
+    tools.run("usr/sbin/e2fsck", "-f", "-n", within)
+    used = _used(tools.run("usr/sbin/dumpe2fs", within), size)
+    return [((start or 0) + place, length) for place, length in used]
 
 
 def _commands(nodes: list[Node], directory: Path, epoch: int) -> list[str]:

@@ -89,11 +89,8 @@ def _boot_card(measured: subject.Subject, emulator: machine.Emulator, out: Path)
         parents = {parent for path in files for parent in PurePosixPath(path).parents} - present - {PurePosixPath("/")}
         nodes += [Node(path) for path in parents]
         nodes += [Node(PurePosixPath(path), content, mode) for path, (mode, content) in files.items()]
-        data = Path(work) / "data.img"
-        ordered = sorted(nodes, key=lambda node: node.path.parts)
-        extents = card.data_partition(made.tools, data, ordered, made.lock.epoch)
         card.begin(made.base, image)
-        card.complete(image, data, extents)
+        card.complete(made.tools, image, sorted(nodes, key=lambda node: node.path.parts), made.lock.epoch)
     qemu.make_overlay(image, overlay, qemu.CARD_BYTES)
     argv = machine.card_command_line(emulator, board, overlay, out / "console.log", out / "results")
     found = machine.execute(emulator, argv, out, _TIMEOUT_S)
