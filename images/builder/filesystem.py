@@ -55,11 +55,12 @@ def make(
     """
     if start is None:
         image.unlink(missing_ok=True)
-    within = f"{image}?offset={start or 0}"
+    offset = start or 0
+    within = f"{image}?offset={offset}"
     tools.run(
         "usr/sbin/mke2fs", "-q", "-F", "-b", str(BLOCK), "-I", "256", "-i", "8192", "-m", "1", "-O", _FEATURES[kind],
         "-L", label, "-U", uuid,
-        "-E", f"hash_seed={uuid},lazy_itable_init=0,lazy_journal_init=0,nodiscard,root_owner=0:0,offset={start or 0}",
+        "-E", f"hash_seed={uuid},lazy_itable_init=0,lazy_journal_init=0,nodiscard,root_owner=0:0,offset={offset}",
         image, str(size // BLOCK),
     )  # fmt: skip
     with tempfile.TemporaryDirectory(dir=image.parent) as directory:
@@ -73,7 +74,7 @@ def make(
         raise UserError(f"cannot write {label} file system: " + "; ".join(mistakes))
     tools.run("usr/sbin/e2fsck", "-f", "-n", within)
     used = _used(tools.run("usr/sbin/dumpe2fs", within), size)
-    return [((start or 0) + place, length) for place, length in used]
+    return [(offset + place, length) for place, length in used]
 
 
 def _commands(nodes: list[Node], directory: Path, epoch: int) -> list[str]:
