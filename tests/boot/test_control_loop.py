@@ -168,12 +168,17 @@ def loop(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReques
 
 
 def test_the_task_starts_with_the_robot(loop: Loop) -> None:
-    """Nothing but late steps ends it, which is the host's doing while it boots."""
+    """Nothing but late steps ends it, which is the host's doing while it boots.
+
+    It may end at any moment, so the starts are counted before the reasons, each of which is written before its start.
+    """
     loop.main_pid()
-    journal = ["sudo", "journalctl", "-b", "-o", "cat", "-u", UNIT]
+    starts = int(loop.unit("NRestarts"))
+    journal = ["sudo", "sh", "-c", f"journalctl --sync && journalctl -b -o cat -u {UNIT}"]
     said = [line for line in loop.robot.shell.run(journal).stdout.splitlines() if line.startswith("flotilla: ")]
     late = [line for line in said if re.search(r"\d+ in a row|no step ended for", line)]
-    assert int(loop.unit("NRestarts")) == len(late), said
+    assert len(late) >= starts, said
+    assert len(late) <= int(loop.unit("NRestarts")) + 1, said
 
 
 def test_heading_is_held_through_a_disturbance(loop: Loop) -> None:

@@ -9,8 +9,9 @@
  * Failure: The flag is 0 once no measurement came for `timeout`, while the port is closed, and from a measurement on
  * that the gyro marks as a fault or that is beyond `full_scale`. While the flag is 0 the values stay the last good
  * ones, and `age` grows. The increment is 0 instead in a step to which one was bad or lost. After each start, and
- * after a silence, measurements count once the gyro has surely taken the mode. A port that is missing or in use is
- * opened again every 100 ms; the journal says once what is wrong.
+ * after a silence, measurements count once the gyro has surely taken the mode. A word counts a millisecond late, once
+ * the word after it is right, too: where bytes were lost, halves of two words can look like one. A port that is missing
+ * or in use is opened again every 100 ms; the journal says once what is wrong.
  */
 #include "dsp3000_frame.h"
 
@@ -124,10 +125,10 @@ static size_t say_mode(void *parser, const void *given, int silent_ms, uint8_t *
     const struct dsp3000 *dsp3000 = given;
     struct parser *self = parser;
     (void)size;
-    if (silent_ms == FL_SERIAL_OPENED)
-        self->words.mode = (uint8_t)dsp3000->mode;
-    /* After a silence the gyro may have been switched on again, and is then in rate mode. */
+    /* After a silence the gyro may have been switched on again, and is then in rate mode. A word that it broke off has
+     * no end. */
     if (silent_ms == FL_SERIAL_OPENED || silent_ms > 0) {
+        self->words = (struct dsp3000_words){.mode = (uint8_t)dsp3000->mode};
         self->repeats = REPEATS;
         self->settling = SETTLING;
     }

@@ -97,17 +97,21 @@ bool dsp3000_words_feed(struct dsp3000_words *words, uint8_t byte, struct dsp300
     bool other = odd_parity(words->window) && words->window >> 31 && (words->window >> 27 & 3) != words->mode;
     words->other[phase] = !other ? 0 : words->other[phase] < DSP3000_OTHER ? words->other[phase] + 1 : DSP3000_OTHER;
     words->wrong |= words->other[phase] == DSP3000_OTHER;
-    if (!possible(words->window, words->mode)) {
+    bool valid = words->window >> 31, right = possible(words->window, words->mode);
+    bool used = *trust == DSP3000_TRUSTED; /* only such a phase's word is held */
+    if (!right)
         *trust = *trust > DSP3000_DISTRUST ? (uint8_t)(*trust - DSP3000_DISTRUST) : 0;
+    else if (valid && *trust < DSP3000_TRUSTED) /* if faults counted as right words, zeros would pass */
+        ++*trust;
+    if (!right || !believed(words, phase)) {
+        words->held = words->held && !used;
         return false;
     }
-    /* A fault is reported at once, but does not count as a right word: otherwise zeros would pass. */
-    bool valid = words->window >> 31;
-    if (valid && *trust < DSP3000_TRUSTED)
-        ++*trust;
-    if (!believed(words, phase))
-        return false;
     double unit = words->mode == DSP3000_RATE ? 60e-6 : 6e-6;
-    *sample = (struct dsp3000_sample){content(words->window) * unit, valid};
-    return true;
+    struct dsp3000_sample now = {content(words->window) * unit, valid};
+    bool given = words->held || !valid;
+    *sample = valid ? words->last : now;
+    words->last = now;
+    words->held = valid;
+    return given;
 }

@@ -33,7 +33,9 @@ bool dsp3000_text_feed(struct dsp3000_text *text, uint8_t byte, struct dsp3000_s
 /* Words of four bytes, the most significant first, with nothing between them to mark where one begins: bit 31 valid,
  * 30-29 synchronisation, 28-27 mode, 26 odd parity of the whole, 25-0 two's complement. So all four alignments are
  * tried at once, and the one is used that has been right for some time while the others were not. Parity detects a
- * single wrong bit, but it is no checksum: one in eighty random words passes. */
+ * single wrong bit, but it is no checksum: one in eighty random words passes, and half of the words whose beginning and
+ * end are of two others because bytes between them were lost. So a word counts once the next one is right, too, a
+ * millisecond later. */
 struct dsp3000_words {
     uint8_t mode;     /* enum dsp3000_mode that is expected: words of another are wrong */
     uint32_t window;  /* the last four bytes */
@@ -42,6 +44,8 @@ struct dsp3000_words {
     uint8_t trust[4]; /* by phase of the word's last byte */
     uint8_t other[4]; /* words of another mode in a row, likewise */
     bool wrong;       /* so many that the gyro is in another mode, since the caller reset this */
+    bool held;        /* `last` waits for the word after it */
+    struct dsp3000_sample last;
 };
 
 enum {
@@ -50,6 +54,7 @@ enum {
     DSP3000_DISTRUST = 4 /* what a wrong word costs: after a single one the stream is back in four milliseconds */
 };
 
+/* Gives the word before, or at once a fault. */
 bool dsp3000_words_feed(struct dsp3000_words *words, uint8_t byte, struct dsp3000_sample *sample);
 
 #endif

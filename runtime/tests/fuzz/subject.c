@@ -85,25 +85,27 @@ static bool feed_words(uint8_t byte)
     return dsp3000_words_feed(&words, byte, &turned);
 }
 
+/* A right word ends with the last byte. What is given is the word before it, which is right too; a fault at once. */
 static const char *wrong_words(const uint8_t *bytes, size_t count)
 {
-    unsigned ones = 0;
-    int32_t content;
-    if (count < 4 * DSP3000_TRUSTED)
+    if (count < 4 * (DSP3000_TRUSTED + (size_t)turned.valid))
         return "trusted too early";
-    for (size_t at = count - 4; at < count; at++)
-        for (unsigned bit = 0; bit < 8; bit++)
-            ones += bytes[at] >> bit & 1u;
-    if (ones % 2 == 0)
-        return "wrong parity";
-    content = (bytes[count - 4] & 3) << 24 | bytes[count - 3] << 16 | bytes[count - 2] << 8 | bytes[count - 1];
+    const uint8_t *last = bytes + count - 4, *given = turned.valid ? last - 4 : last;
+    for (const uint8_t *word = given; word <= last; word += 4) {
+        unsigned ones = 0;
+        for (unsigned bit = 0; bit < 32; bit++)
+            ones += (uint32_t)word[bit / 8] >> bit % 8 & 1u;
+        if (ones % 2 == 0)
+            return "wrong parity";
+        if (word[0] & 0x18)
+            return "another mode";
+        if (turned.valid != (word[0] >= 0x80))
+            return "not the word's validity";
+    }
+    int32_t content = (given[0] & 3) << 24 | given[1] << 16 | given[2] << 8 | given[3];
     if (content >= 1 << 25)
         content -= 1 << 26;
-    if (!(fabs(content * 60e-6 - turned.degrees) < 1e-9))
-        return "not the word's number";
-    if (turned.valid != (bytes[count - 4] >= 0x80))
-        return "not the word's validity";
-    return bytes[count - 4] & 0x18 ? "another mode" : NULL;
+    return fabs(content * 60e-6 - turned.degrees) < 1e-9 ? NULL : "not the word's number";
 }
 
 /* --- records --- */
