@@ -136,7 +136,7 @@ def _robot_images(
             own = apps.get(robot.name, ())
             nodes = data_partition.nodes(fleet, robot, own)  # here, because keys that are missing are made
             made, same = boards[robot.board], common[robot.board]
-            coming.append(threads.submit(_robot_image, fleet, robot, made, same, directory, own, nodes))
+            coming.append(threads.submit(_robot_image, fleet, robot, made, same, directory, own, nodes, many=count > 1))
         said = []
         for number, one in enumerate(coming):
             step.at(number, count, "cards")
@@ -157,16 +157,16 @@ def _threads() -> Iterator[ThreadPoolExecutor]:
 
 def _robot_image(
     fleet: Fleet, robot: Robot, made: BoardBuild, common: _Common, directory: Path, apps: Sequence[BuiltApp],
-    nodes: list[Node],
+    nodes: list[Node], *, many: bool,
 ) -> str:  # fmt: skip
-    """Make it; what it is."""
+    """Make it; what it is. `many`: it is one of several that are made now."""
     final = image_of(robot, directory)
     work = directory / f".{robot.name}.part"
     cache.discard(work)
     work.mkdir(0o700)  # private keys are in what is made here
     new = work / final.name
     try:
-        extents = card.begin(made.base, new)
+        extents = card.begin(made.base, new, past_page_cache=many)
         extents += card.complete(made.tools, new, nodes, made.lock.epoch)
         mapped = bmap.write_bmap(new, extents, bmap.bmap_of(new), common.ranges.result().ranges).mapped
         data_part = manifest.part("data partition", new, card.DATA.start, card.DATA.size)

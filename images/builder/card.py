@@ -32,7 +32,7 @@ import pydantic
 from flotilla.common import cache, paths, yaml_file
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Integer, between
-from images.builder import environment_block, filesystem
+from images.builder import copying, environment_block, filesystem
 from images.builder.filesystem import Node
 from images.builder.tools import Tools
 
@@ -126,7 +126,7 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
     """
     key = cache.digest(
         slot.name, tools.directory.name, str(epoch), board.model_dump_json(), _GRUB_TEMPLATE, _LAYOUT, Path(__file__),
-        Path(filesystem.__file__), Path(environment_block.__file__),
+        Path(filesystem.__file__), Path(environment_block.__file__), Path(copying.__file__),
     )  # fmt: skip
 
     def make(out: Path) -> None:
@@ -141,12 +141,13 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
         ]
         with (out / "card.img").open("wb") as card:
             card.truncate(SIZE)
-            copied = _place(content, [(0, content.stat().st_size)], card.fileno(), SLOTS[0])
             for place, block in blocks:
                 card.seek(place)
                 card.write(block)
-        copied += [(place, -(-len(block) // SECTOR) * SECTOR) for place, block in blocks]
-        (out / "extents.json").write_text(json.dumps(sorted(copied)))
+        size = content.stat().st_size
+        copying.copy(content, [(0, size)], out / "card.img", SLOTS[0].start)
+        held = [(place, -(-len(block) // SECTOR) * SECTOR) for place, block in blocks]
+        (out / "extents.json").write_text(json.dumps(sorted([*held, (SLOTS[0].start, size)])))
 
     return cache.result("card", key, make)
 
@@ -177,17 +178,17 @@ def extents(base_directory: Path) -> Extents:
     return [(start, length) for start, length in json.loads((base_directory / "extents.json").read_text())]
 
 
-def begin(base_directory: Path, out: Path) -> Extents:
+def begin(base_directory: Path, out: Path, *, past_page_cache: bool = False) -> Extents:
     """Write the card `out` up to the robot's data partition. Only what holds anything is written.
 
-    It is for its owner alone: the data partition holds the robot's private key.
+    It is for its owner alone: the data partition holds the robot's private key. `past_page_cache`: see copying.py.
     """
-    whole = Partition(0, "card", 0, SIZE)
     out.unlink(missing_ok=True)
     out.touch(0o600, exist_ok=False)
-    with out.open("r+b") as card:
-        card.truncate(SIZE)
-        return _place(base_directory / "card.img", extents(base_directory), card.fileno(), whole)
+    os.truncate(out, SIZE)
+    held = extents(base_directory)
+    copying.copy(base_directory / "card.img", held, out, past_page_cache=past_page_cache)
+    return held
 
 
 def complete(tools: Tools, card: Path, nodes: list[Node], epoch: int) -> Extents:
@@ -200,19 +201,6 @@ def data_partition(tools: Tools, out: Path, nodes: list[Node], epoch: int, start
     return filesystem.make(
         tools, out, DATA.size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch, start=start
     )
-
-
-def _place(source: Path, extents: Extents, card: int, partition: Partition) -> Extents:
-    """Copy the extents of `source` to a partition; where they lie on the card."""
-    with source.open("rb") as file:
-        for start, length in extents:
-            position, end = start, start + length
-            while position < end:
-                copied = os.copy_file_range(file.fileno(), card, end - position, position, partition.start + position)
-                if not copied:
-                    raise UserError(f"{source} is shorter than its extents")
-                position += copied
-    return [(partition.start + start, length) for start, length in extents]
 
 
 def grub_config(board: Board) -> bytes:
