@@ -15,7 +15,7 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet
 from images.builder import runtime
-from lab.latency import gate, machine, results, subject
+from lab.latency import flood, gate, machine, results, subject
 from lab.latency.results import Latency
 from lab.latency.subject import DIRECTORY
 
@@ -150,6 +150,7 @@ def run(board: Board, out: Path) -> dict[str, str]:
         "task_alone": ["sh", "-c", f"{alone} && cat /run/alone.json"],
         "task_watched": ["sh", "-c", WATCHING.format(run=watched)],
         "watched_rows": ["sh", "-c", "cat /run/watched.[0-9]"],
+        flood.NAME: flood.command(DIRECTORY),
     }
     files = {
         "chain.yml": CHAIN.format(device=device).encode(),
@@ -162,6 +163,7 @@ def run(board: Board, out: Path) -> dict[str, str]:
         "loopback.so": runtime.compile_plugin(PLUGIN, board.architecture),
     }
     files |= {name: (paths.PROJECT / name).read_bytes() for name in EMULATOR}
+    files |= flood.files(board, DIRECTORY)
     measured = subject.build(board)
     out.mkdir(parents=True, exist_ok=True)
     initrd = out / "initrd.img"

@@ -211,11 +211,17 @@ static bool authentic(struct udp_receiver *receiver, size_t rank, const struct s
     return false;
 }
 
-bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, int *budget)
+struct udp_budget udp_budget_of(const struct fl_block *block)
 {
-    if (*budget == UDP_BURST)
+    return (struct udp_budget){UDP_BURST, fl_now_ns() + block->period_ns / UDP_REFUSING};
+}
+
+bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, struct udp_budget *budget)
+{
+    int64_t now_ns = 0;
+    if (budget->datagrams == UDP_BURST)
         count_lost(receiver);
-    while ((*budget)-- > 0) {
+    while (budget->datagrams-- > 0 && now_ns < budget->until_ns) {
         _Alignas(struct cmsghdr) char control[CMSG_SPACE(sizeof(struct __kernel_timespec))];
         struct sockaddr_in sender = {0};
         uint8_t trailer[AUTHENTICATION_TRAILER];
@@ -233,10 +239,11 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
         if (got < 0)
             break;
         size_t rank = rank_of(receiver, &sender);
-        if (!authentic(receiver, rank, &sender, bytes, trailer))
+        bool good = authentic(receiver, rank, &sender, bytes, trailer);
+        now_ns = fl_now_ns();
+        if (!good)
             continue;
-        int64_t stamp_ns = read_stamp(&message);
-        int64_t now_ns = fl_now_ns(), wall_ns = now_ns + wall_less_monotonic_ns();
+        int64_t stamp_ns = read_stamp(&message), wall_ns = now_ns + wall_less_monotonic_ns();
         int64_t came_ns = udp_arrival_ns(stamp_ns, wall_ns, now_ns, receiver->emptied_ns);
         if (fl_failover_takes(&receiver->failover, rank, came_ns, receiver->failover_timeout)) {
             receiver->sender = (uint32_t)rank;
@@ -244,7 +251,7 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
             return true;
         }
     }
-    *budget = 0;
+    budget->datagrams = 0;
     return false;
 }
 

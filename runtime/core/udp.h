@@ -10,7 +10,19 @@ enum {
     UDP_LONGEST = 1500 - 20 - 8,
     /* Most datagrams that one step takes, so that a flood does not delay it. */
     UDP_BURST = 64,
+    /* Of a step's period, one part in so many goes to datagrams that are refused: to find out costs more than to take
+     * one, and who floods a fast task chooses what costs most. */
+    UDP_REFUSING = 4,
 };
+
+/* What one step spends on datagrams. */
+struct udp_budget {
+    int datagrams;
+    int64_t until_ns; /* on CLOCK_MONOTONIC; from then on the next that is refused is the last one looked at */
+};
+
+/* At the begin of a step. */
+struct udp_budget udp_budget_of(const struct fl_block *block);
 
 /* Local address and interface of a socket: members and parameters of a block. */
 #define UDP_LOCAL_MEMBERS                                                                                              \
@@ -101,11 +113,11 @@ void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *
  * time. So the result is limited to the possible interval, from when the queue was last empty until now. */
 int64_t udp_arrival_ns(int64_t stamp_ns, int64_t wall_ns, int64_t now_ns, int64_t emptied_ns);
 
-/* Take the next datagram of the right length from one of the senders: `bytes` has room for the payload. Each call takes
- * one off `budget`, which is UDP_BURST at the begin of a step; with a budget of 0 there is none. `arrived_ns` is when
- * the kernel received it (SO_TIMESTAMPNS, see socket(7)), on CLOCK_MONOTONIC; for the first moments after the first
- * socket of a computer asked for time stamps, when it was read. */
-bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, int *budget);
+/* Take the next datagram of the right length from one of the senders: `bytes` has room for the payload. What is looked
+ * at is taken off `budget`; with none left there is none. `arrived_ns` is when the kernel received it (SO_TIMESTAMPNS,
+ * see socket(7)), on CLOCK_MONOTONIC; for the first moments after the first socket of a computer asked for time stamps,
+ * when it was read. */
+bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, struct udp_budget *budget);
 
 void udp_receiver_close(struct udp_receiver *receiver);
 

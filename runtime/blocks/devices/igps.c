@@ -84,7 +84,7 @@ static int step(struct fl_block *block)
     struct state *state = block->state;
     uint8_t bytes[IGPS_BYTES];
     int64_t arrived_ns;
-    int budget = UDP_BURST;
+    struct udp_budget budget = udp_budget_of(block);
     bool unseen = false;
     state->refused = state->receiver.refused;
     if (block->step == 0)

@@ -1,7 +1,7 @@
 /** udp-receive
  *
- * Receives datagrams of one length, at most 64 in a step. They are stamped by the kernel when they arrive. The block
- * can trigger a task.
+ * Receives datagrams of one length, at most 64 in a step, and looks at those that are refused for about a quarter of a
+ * period. They are stamped by the kernel when they arrive. The block can trigger a task.
  *
  * Failure: The flag is 0 once no datagram was taken for `timeout`. While the flag is 0 the values stay the last good
  * ones, and `age` grows. Datagrams of another length or sender are counted in `refused`, those lost to a full queue in
@@ -87,7 +87,7 @@ static int64_t take(struct fl_block *block)
     const struct udp_receive *udp = block->parameters;
     struct state *state = block->state;
     int64_t arrived_ns, taken_ns = 0;
-    int budget = UDP_BURST;
+    struct udp_budget budget = udp_budget_of(block);
     while (udp_receive(&state->receiver, state->scratch, &arrived_ns, &budget)) {
         memcpy(block->out[DATA], state->scratch, (size_t)udp->length);
         fl_sensor_update(&state->sensor, arrived_ns, state->sensor.sequence + 1);

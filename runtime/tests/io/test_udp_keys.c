@@ -41,11 +41,13 @@ static int end(void **state)
     return rmdir(directory);
 }
 
+/* Its period is long: to look at what is refused has all the time that a busy computer takes. */
 static struct fl_block *receiver(const char *port, const char *take)
 {
     struct fl_block *receive =
         testbed_block("udp-receive", "port", port, "length", "4", "from", ROBOT, "take", take, "keys", file, NULL);
     testbed_begin(receive);
+    receive->period_ns = INT64_C(3600000000000);
     return receive;
 }
 
@@ -138,6 +140,27 @@ static void flood(int attacker, const char *port)
     static const uint8_t nonsense[4 + AUTHENTICATION_TRAILER] = "open";
     for (int i = 0; i < 40; i++)
         send_to(attacker, port, nonsense, sizeof nonsense);
+}
+
+/* Without a time for that, one is looked at, so that a flood ends at all; with a long one, all. */
+static void refuses_for_a_share_of_the_period(void **state)
+{
+    (void)state;
+    const char *port = free_port();
+    struct fl_block *receive = receiver(port, "newest");
+    int attacker = bare(ROBOT, 0);
+    flood(attacker, port);
+    const int64_t period_ns = receive->period_ns;
+    receive->period_ns = 0;
+    testbed_step(receive);
+    assert_int_equal(GET(receive, "forged", uint32_t), 1);
+    testbed_step(receive);
+    assert_int_equal(GET(receive, "forged", uint32_t), 2);
+    receive->period_ns = period_ns;
+    testbed_step(receive);
+    assert_int_equal(GET(receive, "forged", uint32_t), 40);
+    close(attacker);
+    testbed_end(receive);
 }
 
 /* Sending, asking, answering and refusing are for the step: none of it may block. Seen to fail with recv() that waits.
@@ -236,7 +259,8 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(carries_from_the_second_message_on), cmocka_unit_test(refuses_what_is_forged_or_replayed),
         cmocka_unit_test(a_flood_does_not_hide_the_sender),   cmocka_unit_test(steps_do_not_block),
-        cmocka_unit_test(refuses_who_can_have_no_key),        cmocka_unit_test(refuses_to_start_without_a_key),
+        cmocka_unit_test(refuses_for_a_share_of_the_period),  cmocka_unit_test(refuses_who_can_have_no_key),
+        cmocka_unit_test(refuses_to_start_without_a_key),
     };
     stay_on_one_processor();
     return cmocka_run_group_tests(tests, begin, end);
