@@ -78,7 +78,7 @@ def _write_direct(source: int, pages: Extents, target: Path, start: int) -> bool
         out = os.open(target, os.O_WRONLY | os.O_DIRECT)
         try:
             for offset, length in pages:
-                at, end = offset, offset + length
+                at, end = offset, min(offset + length, len(content))
                 while at < end:
                     at += os.pwrite(out, content[at : min(end, at + _AT_ONCE)], start + at)
         finally:

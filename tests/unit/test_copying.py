@@ -49,6 +49,16 @@ def test_a_copy_is_the_same_whichever_way_it_goes(directory: Path, source: Path,
     assert target.read_bytes() == bytes(start) + source.read_bytes()
 
 
+def test_a_source_may_end_within_a_page(directory: Path, source: Path) -> None:
+    """Seen to fail: the rest of the page was awaited for ever."""
+    os.truncate(source, SIZE + 512)
+    target = directory / "target"
+    target.touch()
+    os.truncate(target, SIZE + 512)
+    copying.copy(source, [*EXTENTS, (SIZE, 512)], target, past_page_cache=True)
+    assert target.read_bytes() == source.read_bytes()
+
+
 def test_a_source_that_is_too_short_is_refused(directory: Path, source: Path) -> None:
     target = directory / "target"
     target.touch()
