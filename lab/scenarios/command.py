@@ -14,7 +14,15 @@ from flotilla.fleet.model import Board
 from images.builder import kernel
 from lab.scenarios import crowd, gate, guests, lockstep, report, virtual
 from lab.scenarios.flight import Flight
-from lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, secured, standby
+from lab.scenarios.plans import (
+    SIDE_M,
+    TESTED_SIDE_M,
+    disturbed,
+    over_the_air,
+    plans,
+    secured,
+    standby,
+)
 from lab.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
@@ -53,7 +61,7 @@ def chosen(given: Sequence[str], there: Iterable[str]) -> Iterable[str]:
 
 
 def _fly(names: list[str], side_m: float, board: Board) -> None:
-    every = (plans, disturbed, over_the_air, secured, standby)
+    every = (plans, disturbed, over_the_air, standby)
     there = {plan.name: plan for group in every for plan in group(side_m)}
     for name in chosen(names, there):
         if name not in there:
@@ -82,7 +90,8 @@ def _fly_guests(names: list[str], side_m: float, board: Board, link: str) -> Non
 
 
 def _fly_lockstep(names: list[str], side_m: float, board: Board) -> None:
-    there = {plan.name: plan for plan in (*plans(side_m), *over_the_air(side_m)) if plan.air_loss is not None}
+    every = (*plans(side_m), *over_the_air(side_m), *secured(side_m))
+    there = {plan.name: plan for plan in every if plan.air_loss is not None}
     names = names or [lockstep.DEFAULT]
     if others := [name for name in chosen(names, there) if name not in there]:
         raise UserError(f"{', '.join(others)}: guests in lock-step fly {', '.join(there)}, over the air")

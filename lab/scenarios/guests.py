@@ -228,9 +228,9 @@ class GuestFleet:
                     shell.run(["sudo", "systemctl", "restart", f"flotilla-task@{name}"], timeout=BOOT_SECONDS)
 
 
-def fleet(transport: str, board: Board | None = None, link: str = "ethernet") -> Fleet:
+def fleet(transport: str, board: Board | None = None, link: str = "ethernet", *, dds_security: bool = False) -> Fleet:
     """The scenarios' fleet by wired ports or adapters, and our kernel, which boots fastest."""
-    described = virtual.fleet(transport, board=board)
+    described = virtual.fleet(transport, dds_security=dds_security, board=board)
     network = described.network.model_copy(update={"link": link})
     boards = {name: board.model_copy(update={"kernel": "lean"}) for name, board in described.boards.items()}
     return described.model_copy(update={"network": network, "boards": boards})

@@ -129,7 +129,7 @@ def _changed(node: Node, plan: Plan) -> Node:
 
 def fly(plan: Plan, board: Board, out: Path) -> Flight:
     """Fly it, in the directory `out`."""
-    described = realtime.fleet(plan.transport, board, "ibss")
+    described = realtime.fleet(plan.transport, board, "ibss", dds_security=plan.dds_security)
     board = described.boards[board.name]
     (out / "keys").mkdir(parents=True, exist_ok=True)
     system = subject.build(board)

@@ -36,7 +36,7 @@ _STANDBY = {"robot2": "control"}
 _DDS_LATER_S = 4
 """Tasks that use DDS take that much longer to start, as long as all share one processor."""
 _SECURED_LATER_S = 34
-"""With certificates: five programs prove who they are to each other first, all by one processor."""
+"""With certificates: five programs prove who they are to each other first."""
 _ANNOUNCED_S = 36
 """By then each DDS program has announced itself to all others once more, as it does every 28 s."""
 STATION_GONE_S = 4
@@ -114,7 +114,8 @@ def _strangers(side_m: float) -> Plan:
 
 
 def secured(side_m: float) -> tuple[Plan, ...]:
-    """By DDS with certificates; apart from the others for its time."""
-    title = "the square, by DDS, with certificates"
-    by_dds = square("dds-secured", title, side_m, transport="dds", dds_security=True)
+    """By DDS with certificates, by guests in lock-step: to prove who is who takes more than the one processor that all
+    computers of other flights share."""
+    title = "the square, by DDS, with certificates, over the air of 802.11b"
+    by_dds = square("air-dds-secured", title, side_m, transport="dds", dds_security=True, air_loss=0)
     return (replace(by_dds, seconds=by_dds.seconds + _SECURED_LATER_S),)

@@ -21,7 +21,7 @@ import yaml
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import dds_security, identity, inventory, message_keys
+from flotilla.fleet import identity, inventory, message_keys
 from flotilla.fleet.model import Board, Fleet, Host
 from flotilla.station import telemetry
 from images.builder import runtime
@@ -92,7 +92,7 @@ class Plan:
     changes: Mapping[str, object] = field(default_factory=dict)
     """Parameters of control tasks that are not those of their files, by `task.block.parameter`."""
     dds_security: bool = False
-    """Messages by DDS prove who sent them."""
+    """Messages by DDS prove who sent them; for guests in lock-step."""
     air_loss: float | None = None
     """Frames take their time on a channel of 802.11b that all share (lab/air), and so many of the attempts get lost, 0
     to 1; None: frames take no time on the air, and none gets lost."""
@@ -226,9 +226,7 @@ def _parsed(task: bytes) -> Any:
 def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """A flight as fly.py reads it, and its files by path."""
     directory = DIRECTORY / plan.name
-    described = fleet(
-        plan.transport, plan.standby, second_station=plan.second_station, dds_security=plan.dds_security, board=board
-    )
+    described = fleet(plan.transport, plan.standby, second_station=plan.second_station, board=board)
     flying = described.robot_with("valves")
     brought = _rendered(described, keys)
     there = {
@@ -245,18 +243,15 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
         ]
     for robot in described.robots.values():
         credentials = f"{directory}/{robot.name}"
-        configuration = {f"{directory}/{robot.name}-cyclonedds.xml": "cyclonedds.xml"}
-        if plan.dds_security:
-            configuration[f"{credentials}/{dds_security.CREDENTIAL}"] = dds_security.CREDENTIAL
-        private = {f"{credentials}/{message_keys.CREDENTIAL}": message_keys.CREDENTIAL}
-        there |= {path: brought[robot.name][f"/etc/flotilla/{own}"] for path, own in (configuration | private).items()}
-        parts = ",file://".join(configuration)  # fly.py puts the first `file://` before it
+        configuration = f"{directory}/{robot.name}-cyclonedds.xml"
+        own = {configuration: "cyclonedds.xml", f"{credentials}/{message_keys.CREDENTIAL}": message_keys.CREDENTIAL}
+        there |= {path: brought[robot.name][f"/etc/flotilla/{name}"] for path, name in own.items()}
         for name in robot.control_tasks:
             called = name + STANDBY if name in robot.standby else name
             file = f"{directory}/{called}.yml"
             there[file] = changed(name, brought[robot.name][_path(name)], plan.changes)
             task = {"name": called, "computer": robot.name, "file": file}
-            tasks.append(task | {"cyclonedds": parts, "credentials": credentials})
+            tasks.append(task | {"cyclonedds": configuration, "credentials": credentials})
     events = [asdict(event) for event in plan.events]
     if plan.stranger:
         shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]
