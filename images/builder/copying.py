@@ -32,8 +32,8 @@ Extents = Sequence[tuple[int, int]]
 def copy(source: Path, extents: Extents, target: Path, start: int = 0, *, past_page_cache: bool = False) -> None:
     """Copy the extents of `source` into the file `target`, which exists, so many bytes further from its beginning.
 
-    `past_page_cache` copies whole pages, so what lies around an extent in `source`, too, where `start` and the sizes of
-    both are pages. UserError where `source` ends before an extent does.
+    `past_page_cache` may copy whole pages, and so what lies around an extent in `source`, too. UserError where `source`
+    ends before an extent does.
     """
     size = source.stat().st_size
     if any(offset + length > size for offset, length in extents):

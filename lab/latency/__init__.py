@@ -12,4 +12,5 @@ it does not, stands in the report.
 | `measure`, `init`, `serial_latency.c` | what runs in the guest |
 | `results`, `gate`, `limits`, `report` | figures and histograms; exact comparison with a baseline; limits; the page |
 | `controls` | what the gate has to refuse |
+| `virtual_loop`, `flood` | control loops in that machine; bursts of recorded messages at one of them |
 """

@@ -1,12 +1,11 @@
-/* Sends bursts of datagrams from files, one after the other, each as one datagram:
+/* Sends bursts of one datagram, whose payload is in a file:
  *
- *   flood FROM TO PORT BURST INTERVAL_MS BURSTS FILE…
+ *   flood FROM TO PORT BURST INTERVAL_MS BURSTS FILE
  *
  * FROM and TO are IPv4 addresses, of which FROM is this computer's. It prints how many it sent. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <errno.h>
-#include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -14,7 +13,7 @@
 #include <sys/socket.h>
 #include <time.h>
 
-enum { FILES = 8, LONGEST = 1472, AT_ONCE = 1000 };
+enum { LONGEST = 1472, AT_ONCE = 1000 };
 
 static struct sockaddr_in address(const char *text, const char *port)
 {
@@ -24,38 +23,33 @@ static struct sockaddr_in address(const char *text, const char *port)
     return found;
 }
 
-static bool fail(const char *what)
+static int fail(const char *what)
 {
     fprintf(stderr, "flood: %s: %s\n", what, strerror(errno));
-    return false;
+    return 1;
 }
 
 int main(int count, char **arguments)
 {
-    static char payloads[FILES][LONGEST];
-    static struct iovec parts[FILES];
+    static char payload[LONGEST];
     static struct mmsghdr messages[AT_ONCE];
-    enum { FIRST_FILE = 7 };
-    int files = count - FIRST_FILE;
-    if (files < 1 || files > FILES)
+    if (count != 8)
         return 2;
-    for (int i = 0; i < files; i++) {
-        FILE *file = fopen(arguments[FIRST_FILE + i], "rb");
-        if (!file)
-            return !fail(arguments[FIRST_FILE + i]);
-        parts[i] = (struct iovec){payloads[i], fread(payloads[i], 1, LONGEST, file)};
-        fclose(file);
-    }
     struct sockaddr_in from = address(arguments[1], "0"), to = address(arguments[2], arguments[3]);
     int burst = atoi(arguments[4]), interval_ms = atoi(arguments[5]), bursts = atoi(arguments[6]);
     if (burst < 1 || burst > AT_ONCE || interval_ms < 1 || interval_ms > 999)
         return 2;
+    FILE *file = fopen(arguments[7], "rb");
+    if (!file)
+        return fail(arguments[7]);
+    struct iovec part = {payload, fread(payload, 1, LONGEST, file)};
+    fclose(file);
     for (int i = 0; i < burst; i++)
         messages[i].msg_hdr =
-            (struct msghdr){.msg_name = &to, .msg_namelen = sizeof to, .msg_iov = &parts[i % files], .msg_iovlen = 1};
+            (struct msghdr){.msg_name = &to, .msg_namelen = sizeof to, .msg_iov = &part, .msg_iovlen = 1};
     int fd = socket(AF_INET, SOCK_DGRAM, 0);
     if (fd < 0 || bind(fd, (struct sockaddr *)&from, sizeof from) < 0)
-        return !fail("socket");
+        return fail("socket");
     struct timespec due;
     clock_gettime(CLOCK_MONOTONIC, &due);
     unsigned long sent = 0;

@@ -68,7 +68,7 @@ run() {{{{
   flotilla-run --steps {SECONDS * 90} --statistics /run/flood.$task.json "$@" $task.yml
 }}}}
 run sender & sender=$!
-run receiver --watch in.sequence,in.dropped,in.forged,in.replayed >/run/flood.rows
+run receiver --watch in.sequence,in.dropped,in.replayed >/run/flood.rows
 wait $sender
 wait $flood
 tr -d '\\n' </run/flood.receiver.json

@@ -14,15 +14,7 @@ from flotilla.fleet.model import Board
 from images.builder import kernel
 from lab.scenarios import crowd, gate, guests, lockstep, report, virtual
 from lab.scenarios.flight import Flight
-from lab.scenarios.plans import (
-    SIDE_M,
-    TESTED_SIDE_M,
-    disturbed,
-    over_the_air,
-    plans,
-    secured,
-    standby,
-)
+from lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, secured, standby
 from lab.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"

@@ -74,8 +74,8 @@ def test_the_flight(flown: tuple[str, Flight, Path]) -> None:
 def flies_while_others_prove_who_they_are(flight: Flight) -> None:
     """All come to know each other, and nobody's task is killed for it; four hops take longer than a period then.
 
-    Seen to fail with a real-time priority of what proves: the service manager did not hear for a second that tasks
-    live, and killed two.
+    Seen to fail with a real-time priority of what proves: the service manager did not hear for a second that a task
+    lived, and killed it.
     """
     samples = flight.latency().samples
     print(f"{SECURED}: percentiles of four hops {flight.latency().percentiles_us} µs")
