@@ -10,6 +10,7 @@ from pathlib import Path
 from unittest import mock
 
 from images.builder import runtime
+from images.builder.lock import HOST
 
 OFTEN = 1000
 """Stops of one process, below which it cannot be said that its threads were disturbed."""
@@ -23,7 +24,7 @@ def perturbed_host() -> Iterator[None]:
     """
     with tempfile.TemporaryDirectory() as directory:
         library, log = Path(directory, "perturb.so"), Path(directory, "perturb.log")
-        library.write_bytes(runtime.compile_plugin(Path(__file__).with_name("perturb.c"), "amd64"))
+        library.write_bytes(runtime.compile_plugin(Path(__file__).with_name("perturb.c"), HOST))
         with mock.patch.dict(os.environ, LD_PRELOAD=str(library), PERTURB_LOG=str(log)):
             yield
         stops = [int(line) for line in log.read_text().split()]

@@ -80,7 +80,7 @@ def successor(made: BoardBuild, releases: Releases, directory: Path) -> Content:
     for each in (root, new, out):
         each.mkdir()
     (new / "bytes").write_bytes(random.Random(SEED).randbytes(NEW_BYTES))
-    (new / "overrun.so").write_bytes(runtime.compile_plugin(OVERRUN, made.board.architecture))
+    (new / "overrun.so").write_bytes(runtime.compile_plugin(OVERRUN, made.board.system))
     (new / "freeze").write_text(FREEZE)
     for program in ("overrun.so", "freeze"):
         (new / program).chmod(0o755)

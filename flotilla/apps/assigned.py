@@ -66,7 +66,7 @@ def _built(name: str, board: Board) -> BuiltApp:
     subject = app.load(paths.APPS / name)
     # Rather too much, all of this package and of the builder, than too little.
     key = cache.digest(
-        runtime.key(board.architecture), board.architecture, subject.directory, Path(__file__).parent,
+        runtime.key(board.system), str(board.system), subject.directory, Path(__file__).parent,
         Path(runtime.__file__).parent,
     )  # fmt: skip
 

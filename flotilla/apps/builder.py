@@ -14,7 +14,7 @@ from flotilla.apps import app, ert, fmu
 from flotilla.common import cache, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import privileges
-from flotilla.fleet.model import Board
+from flotilla.fleet.model import Board, System
 from images.builder import runtime, toolchain
 
 _BUILT = ("*.o", "*.d", ".git")
@@ -32,26 +32,26 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
     `run` says where the robot's code is compiled.
     """
     paths.BUILD.mkdir(parents=True, exist_ok=True)
-    with cache.exclusive(), progress.step(f"{subject.name} for {board.architecture}"):
+    with cache.exclusive(), progress.step(f"{subject.name} for {board.system}"):
         (out / "unit.d").mkdir(parents=True)  # what the app's service has beyond runtime/systemd/
         description = subject.description
         try:
             if isinstance(description, app.Make):
-                _make(subject, description, board.architecture, out, run)
+                _make(subject, description, board.system, out, run)
             elif isinstance(description, app.Ert):
                 with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".ert-") as work:
                     source = Path(work) / "source"
                     model, times_s = description.model, description.sample_times
                     tasking = description.tasking
-                    ert.block(subject.directory, model, subject.name, times_s, source, board.architecture, tasking)
+                    ert.block(subject.directory, model, subject.name, times_s, source, board.system, tasking)
                     try:
-                        _blocks(subject, source, ("-Wall",), board.architecture, out, run)
+                        _blocks(subject, source, ("-Wall",), board.system, out, run)
                     except UserError as error:
-                        raise ert.explained(error, board.architecture) from None
+                        raise ert.explained(error, board.system) from None
             elif isinstance(description, app.Fmu):
-                _fmu(subject, description, board.architecture, out, run)
+                _fmu(subject, description, board.system, out, run)
             else:
-                _blocks(subject, subject.directory, runtime.WARNINGS, board.architecture, out, run)
+                _blocks(subject, subject.directory, runtime.WARNINGS, board.system, out, run)
             _allow(description, out)
         except UserError as error:
             raise UserError(f"{paths.shown(subject.directory)}: nothing was built: {error}") from None
@@ -65,31 +65,31 @@ def _allow(description: app.Description, out: Path) -> None:
 
 
 def _blocks(
-    subject: app.App, source: Path, options: Sequence[str], architecture: str, out: Path, run: toolchain.Run
+    subject: app.App, source: Path, options: Sequence[str], system: System, out: Path, run: toolchain.Run
 ) -> None:
     """The plug-in of all that is in `source`, and the task; the runtime judges both as the robot would."""
     task = subject.directory / app.TASK
     (out / "blocks").mkdir()
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".blocks-") as directory:
         if any(source.glob("*.c")):
-            plugin = runtime.compile_plugin(source, architecture, options, run)
+            plugin = runtime.compile_plugin(source, system, options, run)
             (out / "blocks" / f"{subject.name}.so").write_bytes(plugin)
             (Path(directory) / f"{subject.name}.so").write_bytes(plugin)
-            runtime.check_plugins(Path(directory), architecture)
-        runtime.check_task(task, task.read_bytes(), Path(directory), architecture)
+            runtime.check_plugins(Path(directory), system)
+        runtime.check_task(task, task.read_bytes(), Path(directory), system)
     shutil.copyfile(task, out / app.TASK)
 
 
-def _fmu(subject: app.App, description: app.Fmu, architecture: str, out: Path, run: toolchain.Run) -> None:
+def _fmu(subject: app.App, description: app.Fmu, system: System, out: Path, run: toolchain.Run) -> None:
     """The unit, and the plug-in that calls it."""
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as work:
         unit = fmu.read(*fmu.unpacked(subject.directory, description.unit, Path(work) / "unit"))
         fmu.block(unit, subject.name, Path(work) / "source")
-        _blocks(subject, Path(work) / "source", runtime.WARNINGS, architecture, out, run)
-        fmu.build(unit, subject.name, architecture, out, run)
+        _blocks(subject, Path(work) / "source", runtime.WARNINGS, system, out, run)
+        fmu.build(unit, subject.name, system, out, run)
 
 
-def _make(subject: app.App, description: app.Make, architecture: str, out: Path, run: toolchain.Run) -> None:
+def _make(subject: app.App, description: app.Make, system: System, out: Path, run: toolchain.Run) -> None:
     """The program, and how its service differs from a task's."""
     safe = subject.directory / app.SAFE
     if safe.exists():
@@ -103,7 +103,7 @@ def _make(subject: app.App, description: app.Make, architecture: str, out: Path,
         # From the environment, because a Makefile may add to these; it cannot to what stands on make's command line.
         variables = ["CC=gcc", "AR=ar", "PKG_CONFIG=pkg-config", "CFLAGS=-O2 -I/out/include"]
         variables += ["LDFLAGS=-Wl,--build-id=none"]
-        runtime.command(Path(directory), architecture, ["env", "-C", "/out/source", *variables, "make"], run)
+        runtime.command(Path(directory), system, ["env", "-C", "/out/source", *variables, "make"], run)
         if not made.is_file():
             where = paths.shown(subject.directory / app.FILE)
             raise UserError(f"{where}: program: {description.program}: make does not make it; name what it makes")

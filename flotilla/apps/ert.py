@@ -23,6 +23,7 @@ from pycparser import c_ast, c_parser
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.fleet.model import System
 from images.builder import runtime
 
 TEMPLATE = Path(__file__).parent / "templates" / "ert_block.c.j2"
@@ -204,15 +205,15 @@ def block(
     name: str,
     sample_times_s: list[float],
     out: Path,
-    architecture: str,
+    system: System,
     tasking: str | None = None,
 ) -> None:
-    """Fill `out` with the C files of a plug-in for Debian's `architecture`, whose block is `name`.
+    """Fill `out` with the C files of a plug-in for `system`, whose block is `name`.
 
     `tasking`: the key of app.yml.
     """
     code = collect(directory / GENERATED, model, out)
-    found = read(model, preprocess(out, model, code, architecture), code, sample_times_s)
+    found = read(model, preprocess(out, model, code, system), code, sample_times_s)
     found.inner = (out / INNER).is_file()
     if tasking != "single":
         separate(found, code, wanted=tasking == "threads")
@@ -244,7 +245,7 @@ def collect(generated: Path, model: str, out: Path) -> Code:
     return Code(header, sources, "".join(file.read_text(errors="replace") for file in mains))
 
 
-def preprocess(generated: Path, model: str, code: Code, architecture: str) -> str:
+def preprocess(generated: Path, model: str, code: Code, system: System) -> str:
     """The header as the robot's compiler sees it but for the C library, and the definitions of parameters."""
     if re.search(r"^\s*class\s+\w+", _COMMENT.sub("", code.header), re.M):
         raise _cplusplus(model)
@@ -260,14 +261,14 @@ def preprocess(generated: Path, model: str, code: Code, architecture: str) -> st
         argv = ["env", "-C", "/out/source", "gcc", "-E", "-P", "-nostdinc", "-I/out/library", "-I."]
         argv += ["-D__attribute__(x)=", "-o", "/out/model.i", "flotilla_model.c"]
         try:
-            runtime.command(work, architecture, argv)
+            runtime.command(work, system, argv)
         except UserError as error:
-            raise explained(error, architecture) from None
+            raise explained(error, system) from None
         declared = (work / "model.i").read_text()
     return declared + "".join(f"{text}\n" for kind, text in _definitions(code) if re.search(rf"\b{kind}\b", declared))
 
 
-def explained(error: UserError, architecture: str) -> UserError:
+def explained(error: UserError, system: System) -> UserError:
     """What the compiler says of generated code, in terms of the coder's options where these are the cause."""
     if missing := _MISSING.search(str(error)):
         header = missing[1]
@@ -275,7 +276,9 @@ def explained(error: UserError, architecture: str) -> UserError:
         return UserError(f"{GENERATED}/ lacks {header}: it is {_ABSENT.get(Path(header).name, otherwise)}")
     if size := _WORD_SIZE.search(str(error)):
         remedy = "choose the robot's processor (x86-32 or x86-64, Linux) as hardware implementation"
-        return UserError(f"the model was generated for another size of {size[1]} than {architecture} has; {remedy}")
+        return UserError(
+            f"the model was generated for another size of {size[1]} than {system.architecture} has; {remedy}"
+        )
     return error
 
 

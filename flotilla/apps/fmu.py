@@ -24,6 +24,7 @@ import jinja2
 from flotilla.apps import app
 from flotilla.common import paths
 from flotilla.common.errors import Problem, UserError
+from flotilla.fleet.model import System
 from images.builder import runtime, toolchain
 
 TEMPLATE = Path(__file__).parent / "templates" / "fmu_block.c.j2"
@@ -355,7 +356,7 @@ def _start(unit: Unit, variable: str, typed: ElementTree.Element, kind: str) -> 
     return str(int(text) if re.fullmatch(r"\s*[+-]?[0-9]+\s*", text) else int(value)) if whole else repr(value)
 
 
-def sources(unit: Unit, architecture: str) -> Sources | None:
+def sources(unit: Unit, system: System) -> Sources | None:
     """What to compile; None where the unit brings no sources."""
     description = unit.directory / "sources" / "buildDescription.xml"
     if not description.is_file():
@@ -363,7 +364,7 @@ def sources(unit: Unit, architecture: str) -> Sources | None:
         where, key = unit.file, "SourceFiles"
     else:
         where, key = f"{unit.file.removesuffix(DESCRIPTION)}sources/{description.name}", "SourceFile"
-        found = _build_description(unit, description, where, _PLATFORMS["3", architecture])
+        found = _build_description(unit, description, where, _PLATFORMS["3", system.architecture])
     root = (unit.directory / "sources").resolve()
     for name in found.files if found else []:
         path = (root / name).resolve()
@@ -404,9 +405,9 @@ def _build_description(unit: Unit, file: Path, shown: str, platform: str) -> Sou
     return Sources(files, options)
 
 
-def binary(unit: Unit, architecture: str) -> Path:
+def binary(unit: Unit, system: System) -> Path:
     """The folder of the unit's binaries for an architecture."""
-    platform = _PLATFORMS[unit.version, architecture]
+    platform = _PLATFORMS[unit.version, system.architecture]
     binaries = unit.directory / "binaries"
     file, shown = binaries / platform / f"{unit.identifier}.so", unit.file.removesuffix(DESCRIPTION)
     if not file.is_file():
@@ -414,14 +415,16 @@ def binary(unit: Unit, architecture: str) -> Path:
         remedy = "export the unit for it, or with its sources"
         where = f"{shown}binaries/{platform}/{file.name}"
         raise UserError(
-            f"{where}: is missing, and the robot is an {architecture}; there are binaries: {there}; {remedy}"
+            f"{where}: is missing, and the robot is an {system.architecture}; there are binaries: {there}; {remedy}"
         )
     head = file.read_bytes()[:20]
     machine = (head[4], *struct.unpack_from("<H", head, 18)) if len(head) == 20 and head[:4] == b"\x7fELF" else None
-    if machine != _MACHINES[architecture]:
+    if machine != _MACHINES[system.architecture]:
         known = {numbers: name for name, numbers in _MACHINES.items()}
         what = f"for {known[machine]}" if machine in known else "no shared object for a PC"
-        raise UserError(f"{shown}binaries/{platform}/{file.name}: is {what}, not for {architecture}; export it anew")
+        raise UserError(
+            f"{shown}binaries/{platform}/{file.name}: is {what}, not for {system.architecture}; export it anew"
+        )
     return file.parent
 
 
@@ -447,31 +450,31 @@ def render(unit: Unit, name: str) -> str:
     return template.render(unit=unit, name=name, groups=_groups, functions=functions, asked=asked, file=file)
 
 
-def build(unit: Unit, name: str, architecture: str, out: Path, run: toolchain.Run = toolchain.run) -> None:
+def build(unit: Unit, name: str, system: System, out: Path, run: toolchain.Run = toolchain.run) -> None:
     """Fill `out` with the unit as a robot of an architecture needs it: its shared object, and its resources.
 
     `run` says where sources are compiled.
     """
     final = out / object_of(name)
     final.parent.mkdir(parents=True)
-    if found := _sources_unless_binary(unit, architecture):
-        final.write_bytes(_compiled(unit, found, architecture, run))
+    if found := _sources_unless_binary(unit, system):
+        final.write_bytes(_compiled(unit, found, system, run))
         final.chmod(0o755)  # as linkers leave it
     else:
-        place = binary(unit, architecture)
+        place = binary(unit, system)
         shutil.copytree(place, final.parent, dirs_exist_ok=True)
         (final.parent / f"{unit.identifier}.so").rename(final)
     if unit.resources:
         shutil.copytree(unit.directory / "resources", final.parent.parent / "resources")
 
 
-def _sources_unless_binary(unit: Unit, architecture: str) -> Sources | None:
+def _sources_unless_binary(unit: Unit, system: System) -> Sources | None:
     """What to compile; None where it lacks sources, or some of them cannot be, and brings a binary."""
     try:
-        return sources(unit, architecture)
+        return sources(unit, system)
     except UserError:
         try:
-            binary(unit, architecture)
+            binary(unit, system)
         except UserError:
             pass  # what is wrong with its sources says more
         else:
@@ -479,7 +482,7 @@ def _sources_unless_binary(unit: Unit, architecture: str) -> Sources | None:
         raise
 
 
-def _compiled(unit: Unit, found: Sources, architecture: str, run: toolchain.Run) -> bytes:
+def _compiled(unit: Unit, found: Sources, system: System, run: toolchain.Run) -> bytes:
     """The unit's sources as a shared object."""
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as directory:
         tree = Path(directory) / "source"
@@ -487,7 +490,7 @@ def _compiled(unit: Unit, found: Sources, architecture: str, run: toolchain.Run)
         shutil.copytree(HEADERS, tree / "fmi")
         options = ["-std=gnu17", "-Wall", "-Wl,-Bsymbolic,-z,defs", "-Isources", "-Ifmi", *found.options]
         files = [f"sources/{name}" for name in found.files]
-        return runtime.compile_shared(tree, files, architecture, options, run)
+        return runtime.compile_shared(tree, files, system, options, run)
 
 
 def _groups(variables: list[Variable]) -> dict[str, list[tuple[int, Variable]]]:

@@ -16,6 +16,7 @@ import yaml
 from flotilla.apps import app, ert
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.fleet.model import System
 
 FILES = 5000
 """At most, in an archive. MATLAB's own headers are some hundreds."""
@@ -30,7 +31,7 @@ _NESTED = {"mlrFiles.zip", "sDirFiles.zip", "otherFiles.zip"}
 def create(
     archive: Path,
     name: str,
-    architectures: Sequence[str],
+    systems: Sequence[System],
     model: str | None = None,
     sample_times_s: Sequence[float] = (),
     parent: Path | None = None,
@@ -38,7 +39,7 @@ def create(
     """Lay out the code of `archive` as the app `name` in `parent`, by default the project's `apps/`.
 
     Replaces the generated code of an app that is there, and nothing else of it. For a new one it writes app.yml, and a
-    task.yml in which the model's inputs are zero; for this it reads the code as one of `architectures` has it. Nothing
+    task.yml in which the model's inputs are zero; for this it reads the code as one of `systems` has it. Nothing
     changes after UserError. Returns what to do with it.
     """
     directory = (parent or paths.APPS) / app.check_name(name)
@@ -68,7 +69,7 @@ def create(
         if sample_times_s:
             description["sample_times"] = list(sample_times_s)  # type: ignore[assignment]
         (work / app.FILE).write_text(yaml.safe_dump(description, sort_keys=False))
-        (work / app.TASK).write_text(_task(work, name, model, sample_times_s, architectures))
+        (work / app.TASK).write_text(_task(work, name, model, sample_times_s, systems))
         work.rename(directory)
     inputs = f"wire the model's inputs in {paths.shown(directory / app.TASK)}, which are zero"
     return f"{paths.shown(directory)} is ready; {inputs}, and bring it to a robot: {_deploy(directory)}"
@@ -159,14 +160,14 @@ def _model(archive: Path, generated: Path) -> str:
     return found.pop()
 
 
-def _task(work: Path, name: str, model: str, sample_times_s: Sequence[float], architectures: Sequence[str]) -> str:
+def _task(work: Path, name: str, model: str, sample_times_s: Sequence[float], systems: Sequence[System]) -> str:
     """A task of the model alone."""
     errors: list[UserError] = []
-    for number, architecture in enumerate(architectures):
+    for number, system in enumerate(systems):
         try:
             out = work.parent / f"read-{number}"
             code = ert.collect(work / ert.GENERATED, model, out)
-            found = ert.read(model, ert.preprocess(out, model, code, architecture), code, list(sample_times_s))
+            found = ert.read(model, ert.preprocess(out, model, code, system), code, list(sample_times_s))
         except UserError as error:
             errors.append(error)
             continue

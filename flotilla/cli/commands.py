@@ -406,9 +406,9 @@ def _import_model(arguments: argparse.Namespace) -> None:
     from flotilla.apps import imported
     from flotilla.fleet import inventory
 
-    architectures = sorted({board.architecture for board in inventory.load_fleet().boards.values()})
+    systems = sorted({board.system for board in inventory.load_fleet().boards.values()})
     times_s = arguments.sample_times or []
-    print(imported.create(arguments.archive, arguments.name, architectures, arguments.model, times_s))
+    print(imported.create(arguments.archive, arguments.name, systems, arguments.model, times_s))
 
 
 def _import_model_arguments(parser: argparse.ArgumentParser) -> None:

@@ -585,6 +585,11 @@ def _boards(raw: dict[str, Any]) -> Iterator[Finding]:
             loc = ("boards", name, "kernel_arguments")
             yield loc, f"the kernel makes only ttyS0 to ttyS{uarts - 1}", f"add 8250.nr_uarts={max(16, needed)}"
 
+        if board.get("architecture") == "i386":
+            if board.get("suite") == "trixie":
+                yield ("boards", name, "suite"), "Debian 13 has no kernel for i386", "bookworm"
+            if board.get("firmware") == "uefi":
+                yield ("boards", name, "firmware"), "the boot loader for UEFI is for amd64", "bios"
         if board.get("architecture") == "amd64" and board.get("qemu", {}).get("system") == "i386":
             yield ("boards", name, "qemu", "system"), "cannot run amd64", "x86_64"
 

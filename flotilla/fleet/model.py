@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 from pydantic_core import PydanticCustomError
@@ -154,6 +154,7 @@ SignalName = Annotated[
 ]
 Word = Annotated[str, matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
 Architecture = Literal["i386", "amd64"]
+Release = Literal["bookworm", "trixie"]
 """Debian's names of the processor architectures that boards may have."""
 Processor = Annotated[
     str, matching(r"[a-z0-9][a-z0-9._-]*", "is not a value of GCC's -march", "such as pentium3, see `man gcc`")
@@ -275,6 +276,16 @@ def _by_tty(ports: dict[str, Port]) -> dict[str, Port]:
     return dict(sorted(ports.items(), key=lambda item: (len(item[1].tty), item[1].tty)))
 
 
+class System(NamedTuple):
+    """What programs are compiled for: an architecture, and a release whose libraries they load."""
+
+    architecture: Architecture
+    suite: Release
+
+    def __str__(self) -> str:
+        return f"{self.architecture} of {self.suite}"
+
+
 class Board(_Model):
     """Everything that differs between kinds of computer: one file in `group_vars/` each."""
 
@@ -284,6 +295,11 @@ class Board(_Model):
     """The computer in one line, for reports."""
     architecture: Architecture
     """Debian's name of the processor architecture."""
+    suite: Release = "bookworm"
+    """Debian's name of the release that its packages are of: Debian 12 or 13. Debian 13 has no kernel for i386."""
+    firmware: Literal["bios", "uefi"] = "bios"
+    """What starts the card. `bios`: the boot loader is in an MBR. `uefi`: it is a file in a system partition, and the
+    partition table a GPT."""
     processor: Processor | None = None
     """Processor for which programs that measure the board are compiled: a value of GCC's `-march`. Leave it out for
     the oldest one of the architecture."""
@@ -309,6 +325,11 @@ class Board(_Model):
     """The machine that stands in for the board in `make boot` and in tests."""
     acceptance: Acceptance = Field(default=Acceptance(), exclude=True)
     """What `make accept` asks of a computer of this kind."""
+
+    @property
+    def system(self) -> System:
+        """What its programs are compiled for."""
+        return System(self.architecture, self.suite)
 
     @property
     def machine(self) -> str:

@@ -167,7 +167,7 @@ def _robot_image(
     new = work / final.name
     try:
         extents = card.begin(made.base, new, past_page_cache=many)
-        extents += card.complete(made.tools, new, nodes, made.lock.epoch)
+        extents += card.complete(made.board, made.tools, new, nodes, made.lock.epoch)
         mapped = bmap.write_bmap(new, extents, bmap.bmap_of(new), common.ranges.result().ranges).mapped
         data_part = manifest.part("data partition", new, card.DATA.start, card.DATA.size)
         beginning = common.beginning.result().copy()

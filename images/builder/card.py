@@ -1,16 +1,18 @@
-"""The card: MBR, GRUB, boot state, slots A and B, data partition. A file, made without loop device or mount.
+"""The card: boot loader, boot state, slots A and B, data partition. A file, made without loop device or mount.
 
 All cards of a board are the same up to the data partition: `base` makes that part once, `begin` copies it, `complete`
 adds a robot's data. What is in a slot, `slot.py` makes.
 
 | from | what |
 |---|---|
-| 0 | MBR: GRUB's boot.img, disk identifier, partition table |
+| 0 | MBR: GRUB's boot.img, disk identifier, partition table; with UEFI a GPT |
 | 512 bytes | GRUB's core image, with every module it needs, and its configuration |
+| 1 MiB | with UEFI instead: the system partition (FAT16), in which that image is a program |
 | 4 MiB | boot state, raw: tries, and two copies of the state, 4 MiB from each other (runtime/programs/boot_state.h) |
 | then | slot A |
 | then | slot B (empty until the first update) |
 | then | data (ext4): the robot's identity, then all that changes; grows to the card on first boot |
+| then | with UEFI: the GPT's copy, which the first boot moves to the end of the card |
 
 `images/boot/card.yml` says the identifier and the sizes.
 """
@@ -23,24 +25,32 @@ import os
 import struct
 import tarfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import pydantic
 
 from flotilla.common import cache, paths, yaml_file
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Integer, between
-from images.builder import copying, environment_block, filesystem
+from images.builder import copying, environment_block, filesystem, uefi
 from images.builder.filesystem import Node
 from images.builder.tools import Tools
 
 MIB = 1 << 20
-_GRUB_MODULES = """
-    biosdisk part_msdos memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot
-    iorw
-"""
+_GRUB_MODULES = "memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot iorw"
+
+
+class _Grub(NamedTuple):
+    """What GRUB is made of, by the board's firmware."""
+
+    platform: str
+    modules: str
+    """Beside `_GRUB_MODULES`."""
+
+
+_GRUB = {"bios": _Grub("i386-pc", "biosdisk part_msdos"), "uefi": _Grub("x86_64-efi", "part_gpt regexp efi_gop")}
 _GRUB_TEMPLATE = paths.PROJECT / "images" / "boot" / "grub.cfg.j2"
 _LAYOUT = paths.PROJECT / "images" / "boot" / "card.yml"
 _DATA_UUID = "5b0e4a3c-6f1d-4c58-9d0a-000000000004"
@@ -74,13 +84,18 @@ class Partition:
     size: int
     """Bytes."""
 
-    @property
-    def partuuid(self) -> str:
-        return f"{LAYOUT.disk_id:08x}-{self.number:02}"
+    def partuuid(self, board: Board) -> str:
+        """What `root=PARTUUID=` calls it on a card of the board."""
+        return guid(self.number) if board.firmware == "uefi" else f"{LAYOUT.disk_id:08x}-{self.number:02}"
 
     @property
     def end(self) -> int:
         return self.start + self.size
+
+
+def guid(number: int) -> str:
+    """Of a partition in a GPT; 0: of the card. As the identifier in an MBR, all cards have the same."""
+    return f"{LAYOUT.disk_id:08x}-0000-4000-8000-{number:012}"
 
 
 REGION = 4 * MIB
@@ -90,6 +105,8 @@ _A = Partition(2, "A", STATE.end, LAYOUT.slot_mib * MIB)
 SLOTS = [_A, Partition(3, "B", _A.end, LAYOUT.slot_mib * MIB)]
 DATA = Partition(4, "data", SLOTS[-1].end, LAYOUT.data_mib * MIB)
 SIZE = DATA.end
+SYSTEM = Partition(5, "system", MIB, STATE.start - MIB)
+"""Where UEFI finds the boot loader. It has the last number, so that all others have the same on every card."""
 
 SECTOR = 512
 TRIES = SECTOR
@@ -106,9 +123,27 @@ HEADER_ROOM = 4096
 """Before a slot's end: there its header begins."""
 _TYPES = {"state": 0xDA, "A": 0x83, "B": 0x83, "data": 0x83}
 """Of partitions, in the MBR: 0xDA is data without a file system."""
+_GPT_TYPES = {"system": "C12A7328-F81F-11D2-BA4B-00A0C93EC93B"} | dict.fromkeys(
+    _TYPES, "0FC63DAF-8483-4772-8E79-3D69D8477DE4"
+)
+"""Of partitions, in a GPT: UEFI's system partition, and data of Linux, which no other system touches."""
+_GPT_HEAD, _GPT_TAIL = 34 * 512, MIB
+"""Bytes at the beginning of an image, an MBR that protects it, header and 128 entries; at its end, for their copy."""
 
 Extents = list[tuple[int, int]]
 """Byte ranges (offset, length) of a card that hold anything."""
+
+
+def partitions(board: Board) -> list[Partition]:
+    """Those of a card of the board, in the order in which they lie."""
+    if board.firmware == "bios":
+        return [STATE, *SLOTS, DATA]
+    return [SYSTEM, STATE, *SLOTS, data(board)]
+
+
+def data(board: Board) -> Partition:
+    """The data partition: a GPT has its copy behind it."""
+    return DATA if board.firmware == "bios" else replace(DATA, size=DATA.size - _GPT_TAIL)
 
 
 def kernel_arguments(board: Board) -> list[str]:
@@ -126,18 +161,16 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
     """
     key = cache.digest(
         slot.name, tools.directory.name, str(epoch), board.model_dump_json(), _GRUB_TEMPLATE, _LAYOUT, Path(__file__),
-        Path(filesystem.__file__), Path(environment_block.__file__), Path(copying.__file__),
+        Path(filesystem.__file__), Path(environment_block.__file__), Path(copying.__file__), Path(uefi.__file__),
     )  # fmt: skip
 
     def make(out: Path) -> None:
-        core = grub_core(board, tools, out, grub_config(board))
         content, header = slot / "slot.img", (slot / "header").read_bytes()
         blocks = [(STATE.start, tries_block())] + [(STATE.start + place, state_copy()) for place in COPIES]
         blocks += [
             (SLOTS[0].end - HEADER_ROOM, header),
             (SLOTS[1].end - HEADER_ROOM, bytes(HEADER_ROOM)),
-            (0, _boot_sector(tools)),
-            (SECTOR, core),
+            *boot_loader(board, tools, out, grub_core(board, tools, out, grub_config(board))),
         ]
         with (out / "card.img").open("wb") as card:
             card.truncate(SIZE)
@@ -150,6 +183,36 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
         (out / "extents.json").write_text(json.dumps(sorted([*held, (SLOTS[0].start, size)])))
 
     return cache.result("card", key, make)
+
+
+def boot_loader(board: Board, tools: Tools, work: Path, core: bytes) -> list[tuple[int, bytes]]:
+    """What lies before the boot state, and of a GPT behind the data partition: places on the card, and bytes.
+
+    `core`: GRUB's core image. `work`: a directory for what is thrown away.
+    """
+    if board.firmware == "bios":
+        return [(0, _boot_sector(tools)), (SECTOR, core)]
+    head, tail = _gpt(board, tools, work / "gpt")
+    return [(0, head), (SYSTEM.start, uefi.system_partition(tools, work, SYSTEM.size, core)), (SIZE - len(tail), tail)]
+
+
+def _gpt(board: Board, tools: Tools, work: Path) -> tuple[bytes, bytes]:
+    """Beginning and end of a card with a GPT."""
+    lines = ["label: gpt", f"label-id: {guid(0)}", "unit: sectors", "first-lba: 34", "table-length: 128"]
+    lines += [
+        f"{one.number}: start={one.start // SECTOR}, size={one.size // SECTOR}, name={one.name}, "
+        f"type={_GPT_TYPES[one.name]}, uuid={one.partuuid(board)}"
+        for one in sorted(partitions(board), key=lambda one: one.number)
+    ]
+    with work.open("wb") as card:
+        card.truncate(SIZE)
+    tools.run("usr/sbin/sfdisk", "--quiet", "--no-reread", "--no-tell-kernel", work, stdin="\n".join(lines) + "\n")
+    with work.open("rb") as card:
+        head = card.read(_GPT_HEAD)
+        card.seek(-33 * SECTOR, os.SEEK_END)
+        tail = card.read()
+    work.unlink()
+    return head, tail
 
 
 def tries_block(name: str = "tries") -> bytes:
@@ -191,15 +254,17 @@ def begin(base_directory: Path, out: Path, *, past_page_cache: bool = False) -> 
     return held
 
 
-def complete(tools: Tools, card: Path, nodes: list[Node], epoch: int) -> Extents:
+def complete(board: Board, tools: Tools, card: Path, nodes: list[Node], epoch: int) -> Extents:
     """Add the data partition with the robot's files to a card that `begin` made."""
-    return data_partition(tools, card, nodes, epoch, DATA.start)
+    return data_partition(board, tools, card, nodes, epoch, DATA.start)
 
 
-def data_partition(tools: Tools, out: Path, nodes: list[Node], epoch: int, start: int | None = None) -> Extents:
+def data_partition(
+    board: Board, tools: Tools, out: Path, nodes: list[Node], epoch: int, start: int | None = None
+) -> Extents:
     """Write the data partition with the robot's files, as the file `out`, or so many bytes behind its beginning."""
     return filesystem.make(
-        tools, out, DATA.size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch, start=start
+        tools, out, data(board).size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch, start=start
     )
 
 
@@ -217,6 +282,10 @@ def grub_config(board: Board) -> bytes:
     text: str = environment.from_string(_GRUB_TEMPLATE.read_text()).render(
         board=board,
         slots=SLOTS,
+        place=lambda partition: (
+            f"($disk,gpt{partition.number})" if board.firmware == "uefi" else f"(hd0,msdos{partition.number})"
+        ),
+        partuuid=lambda slot: slot.partuuid(board),
         state_partition=STATE,
         tries=TRIES // SECTOR,
         copies=[place // SECTOR for place in COPIES],
@@ -238,16 +307,17 @@ def grub_core(board: Board, tools: Tools, out: Path, config: bytes) -> bytes:
         member = tarfile.TarInfo("grub.cfg")
         member.size = len(config)
         archive.addfile(member, io.BytesIO(config))
-    modules = tools.directory / "usr/lib/grub/i386-pc"
+    grub = _GRUB[board.firmware]
+    modules = tools.directory / "usr/lib/grub" / grub.platform
     tools.run(
-        "usr/bin/grub-mkimage", "-O", "i386-pc", "-d", modules, "-c", begin,
+        "usr/bin/grub-mkimage", "-O", grub.platform, "-d", modules, "-c", begin,
         "-m", inside, "-p", "(memdisk)",  # in this order: a memdisk moves the prefix into itself
-        "-o", core, *_GRUB_MODULES.split(),
+        "-o", core, *grub.modules.split(), *_GRUB_MODULES.split(),
     )  # fmt: skip
     content = core.read_bytes()
     for file in (core, begin, inside):
         file.unlink()
-    if len(content) > STATE.start - SECTOR:
+    if board.firmware == "bios" and len(content) > STATE.start - SECTOR:
         raise UserError(f"GRUB's core image of {len(content)} bytes does not fit before the first partition")
     return content
 

@@ -21,13 +21,16 @@ import pydantic
 
 from flotilla.common import paths, progress, yaml_file
 from flotilla.common.errors import UserError
-from flotilla.fleet.model import Architecture, Board, Word
+from flotilla.fleet.model import Architecture, Board, System, Word
 from images.builder import mirror
 from images.builder.mirror import DEBIAN, SECURITY, Mirrors
 
 _COMPONENTS = "main non-free-firmware"
 _KEYRINGS = tuple(Path("/usr/share/keyrings", f"debian-archive-keyring.{suffix}") for suffix in ("gpg", "pgp"))
 _DATE = "%Y-%m-%dT%H:%M:%SZ"
+
+HOST = System("amd64", "trixie")
+"""What programs of the runtime are compiled for that this computer runs, where no board says otherwise."""
 
 Role = Literal["required", "userland", "kernel"]
 """`required`: Essential, or of that priority in the archive's index; `kernel`: not installed with its dependencies."""
@@ -48,7 +51,7 @@ class File(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     suite: Word
-    """Debian's name of the release that all packages are of."""
+    """Debian's name of the release that all packages are of but a board's."""
     locks: dict[str, _Asked]
     """Locks of other things than boards, by name."""
 
@@ -65,15 +68,25 @@ class Recipe:
 
 
 def recipes(boards: Iterable[Board]) -> dict[str, Recipe]:
-    """Of all locks by name: the boards', and those of locks.yml."""
+    """Of all locks by name: the boards', those of their runtimes and of this computer's, and those of locks.yml."""
+    boards = list(boards)
     path = paths.PACKAGES / "locks.yml"
     file = yaml_file.read(path, File)
-    found = {board.name: Recipe(file.suite, board.architecture, ("robot", board.name)) for board in boards}
+    found: dict[str, Recipe] = {}
+    for board in boards:
+        found[board.name] = Recipe(board.suite, board.architecture, ("robot", f"robot-{board.suite}", board.name))
     for name, asked in file.locks.items():
         if name in found:
             raise UserError(f"{paths.shown(path)}: locks.{name}: is a board's name, too; give one of them another")
         found[name] = Recipe(file.suite, asked.architecture, (asked.list or name,), system=False)
+    for system in sorted({HOST, *(board.system for board in boards)}):
+        found[runtime_lock(system)] = Recipe(system.suite, system.architecture, ("runtime",), system=False)
     return found
+
+
+def runtime_lock(system: System) -> str:
+    """Name of the lock of the runtime's compiler and libraries."""
+    return f"runtime-{system.suite}-{system.architecture}"
 
 
 def suites(release: str) -> tuple[tuple[str, str], ...]:

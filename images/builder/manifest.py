@@ -203,8 +203,7 @@ def shared(board: Board, locks: tuple[Lock, Lock], root: Path, content: Path, ba
 
 def board_parts(root: Path, content: Path, base: Path) -> list[Part]:
     """What all cards of a board have in common, piece by piece."""
-    start = card.extents(base)[0]
-    regions = {"mbr+grub": start, "boot state": (card.STATE.start, card.STATE.size)}
+    regions = {"boot loader": (0, card.STATE.start), "boot state": (card.STATE.start, card.STATE.size)}
     parts = [part(name, base / "card.img", *region) for name, region in regions.items()]
     files = [root / name for name in ("vmlinuz", "initrd.img", "root.squashfs") if (root / name).exists()]
     files.append(content / "slot.img")
@@ -415,7 +414,7 @@ def write(
         source=source,
         image=image,
         parts=[*same.parts, data],
-        partitions=partitions(extents),
+        partitions=partitions(board, extents),
         packages=same.packages,
         apps=[entry_of(app) for app in apps],
         hostvars=hostvars(fleet, robot),
@@ -464,7 +463,7 @@ def inputs_of_board(board: Board, locks: tuple[Lock, Lock]) -> str:
     images = paths.PROJECT / "images"
     own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
     return cache.digest(
-        *(lock.digest for lock in locks), *own_kernel, runtime.key(board.architecture), paths.OVERLAY,
+        *(lock.digest for lock in locks), *own_kernel, runtime.key(board.system), paths.OVERLAY,
         images / "release.yml", images / "rootfs", images / "boot", images / "builder",
         paths.PROJECT / "flotilla" / "fleet", paths.PROJECT / "flotilla" / "common",
         paths.PROJECT / "requirements.lock",
@@ -486,14 +485,14 @@ def inputs(of_board: str, nodes: list[Node]) -> str:
     return cache.digest(of_board, *identity)
 
 
-def partitions(extents: card.Extents) -> list[Partition]:
+def partitions(board: Board, extents: card.Extents) -> list[Partition]:
     """The partition table, with how much of each partition the extents of a card fill."""
-    contents = {"state": "raw", "A": "squashfs", "B": "empty", "data": "ext4"}
+    contents = {"system": "fat", "state": "raw", "A": "squashfs", "B": "empty", "data": "ext4"}
     return [
         Partition(
             number=partition.number,
             name=partition.name,
-            partuuid=partition.partuuid,
+            partuuid=partition.partuuid(board),
             content=contents[partition.name],
             start=partition.start,
             bytes=partition.size,
@@ -501,7 +500,7 @@ def partitions(extents: card.Extents) -> list[Partition]:
                 length for start, length in extents if partition.start <= start < partition.start + partition.size
             ),
         )
-        for partition in (card.STATE, *card.SLOTS, card.DATA)
+        for partition in card.partitions(board)
     ]
 
 

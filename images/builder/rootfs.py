@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import fnmatch
 import json
+import lzma
 import os
 import re
 import shutil
@@ -46,7 +47,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     own = kernel.board_kernel(board) if board.kernel == "lean" else None
     if own:
         lock = lock.without("kernel")
-    drivers = runtime.build(lock.architecture)
+    drivers = runtime.build(board.system)
     sources = [Path(__file__).parent / name for name in _STAGE_FILES]
     key = cache.digest(
         lock.digest,
@@ -161,7 +162,7 @@ def main(description_file: str) -> None:
         _bootstrap(stage, description["architecture"], description["release"], description["packages"])
     stage.in_target("perl", "-MPOSIX=strftime", "-e", 'print strftime("clock of the target: %F\\n", gmtime)')
     with _timed("kernel"):
-        version = _kernel(stage, description["kernels"])
+        version = _kernel(stage, description["architecture"], description["kernels"])
     with _timed("runtime"):
         shutil.copy(stage.tools / "repository" / description["runtime"], stage.target / "tmp/runtime.deb")
         stage.in_target("dpkg", "--install", "/tmp/runtime.deb")
@@ -236,7 +237,7 @@ def _remove_excluded(target: Path) -> None:
                 (Path(parent) / name).unlink()
 
 
-def _kernel(stage: Stage, debs: list[str]) -> str:
+def _kernel(stage: Stage, architecture: str, debs: list[str]) -> str:
     """Unpack the kernel package without its maintainer scripts, whose work (initramfs, links) is done here."""
     (stage.target / "tmp/kernel").mkdir()
     names = []
@@ -251,23 +252,26 @@ def _kernel(stage: Stage, debs: list[str]) -> str:
     stage.in_target("dpkg", "--configure", "--force-depends", "--pending")
     shutil.rmtree(stage.target / "tmp/kernel")
     (version,) = (path.name for path in (stage.target / "lib/modules").iterdir())
-    _prune_modules(stage, version)
+    _prune_modules(stage, architecture, version)
     return version
 
 
-def _prune_modules(stage: Stage, version: str) -> None:
+def _prune_modules(stage: Stage, architecture: str, version: str) -> None:
     directory = stage.target / "lib/modules" / version
     stage.in_tools("depmod", "-b", "/target", version)
     needs = dict(line.split(":", 1) for line in (directory / "modules.dep").read_text().splitlines())
     kept: set[str] = set()
-    for pattern in _list("modules.list"):
-        for module in fnmatch.filter(needs, f"kernel/{pattern}.ko"):
+    own = f"modules-{architecture}.list"
+    for pattern in _list("modules.list") + (_list(own) if (_DATA / own).is_file() else []):
+        for module in fnmatch.filter(needs, f"kernel/{pattern}.ko*"):
             kept |= {module, *needs[module].split()}
-    for path in (directory / "kernel").rglob("*.ko"):
+    for path in sorted((directory / "kernel").rglob("*.ko*")):
+        content = path.read_bytes()
+        path.unlink()
         if str(path.relative_to(directory)) in kept:
-            path.write_bytes(debian_kernel.without_signature(path.read_bytes()))
-        else:
-            path.unlink()
+            if path.suffix == ".xz":  # as Debian 13 packs them: squashfs packs better what is not, and insmod needs it
+                path, content = path.with_suffix(""), lzma.decompress(content)
+            path.write_bytes(debian_kernel.without_signature(content))
     stage.in_tools("depmod", "-b", "/target", version)
 
 

@@ -1,4 +1,4 @@
-"""The runtime as Debian packages: compiled from `runtime/` by a locked compiler, for one architecture."""
+"""The runtime as Debian packages: compiled from `runtime/` by a locked compiler, for one architecture and release."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from pathlib import Path
 
 from flotilla.common import cache, namespace, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.fleet.model import System
 from images.builder import pool, runtime_stage, toolchain, tools
-from images.builder.lock import read_lock
+from images.builder.lock import HOST, read_lock, runtime_lock
 
 SOURCE = paths.PROJECT / "runtime"
-LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libnettle8", "libsystemd0", "libyaml-0-2")
-"""Packages whose libraries its programs load; robots have them from images/packages/robot.list."""
+_LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libnettle8", "libsystemd0", "libyaml-0-2")
+_RENAMED = {"trixie": {"libddsc0debian": "libddsc0t64", "libnettle8": "libnettle8t64"}}
+"""Debian's newer names, by release."""
 WARNINGS = ("-Wall", "-Wextra", "-Werror")
 """Compiler options for code that is written by hand."""
 _LOADERS = {
@@ -49,28 +51,33 @@ class Runtime:
         return package
 
 
-def command(work: Path, architecture: str, argv: Sequence[str], run: toolchain.Run = toolchain.run) -> None:
+def libraries(system: System) -> list[str]:
+    """Packages whose libraries its programs load; robots have them from images/packages/robot*.list."""
+    return [_RENAMED.get(system.suite, {}).get(name, name) for name in _LIBRARIES]
+
+
+def command(work: Path, system: System, argv: Sequence[str], run: toolchain.Run = toolchain.run) -> None:
     """Run a command among the locked compiler and libraries of an architecture; errors are its own words.
 
     There, `work` is /out, and gets the public headers in /out/include. `run` says where that is; so does it below.
     """
     shutil.copytree(SOURCE / "include", work / "include")
-    log = paths.BUILD / f"compile-{architecture}.log"
+    log = paths.BUILD / f"compile-{system.suite}-{system.architecture}.log"
     with cache.locked(log.with_name(f".{log.name}.lock")):  # an error shows what the log ends with
-        run(f"runtime-{architecture}", work, argv, log)
+        run(runtime_lock(system), work, argv, log)
 
 
 def compile_plugin(
-    source: Path, architecture: str, options: Sequence[str] = WARNINGS, run: toolchain.Run = toolchain.run
+    source: Path, system: System, options: Sequence[str] = WARNINGS, run: toolchain.Run = toolchain.run
 ) -> bytes:
     """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture."""
     files = sorted(file.name for file in source.glob("*.c")) if source.is_dir() else [source.name]
     options = ["-std=c11", *options, "-fvisibility=hidden", "-I/out/include"]
-    return compile_shared(source, files, architecture, options, run)
+    return compile_shared(source, files, system, options, run)
 
 
 def compile_shared(
-    source: Path, files: Sequence[str], architecture: str, options: Sequence[str], run: toolchain.Run = toolchain.run
+    source: Path, files: Sequence[str], system: System, options: Sequence[str], run: toolchain.Run = toolchain.run
 ) -> bytes:
     """A C file, or some of a directory, as a shared object for robots of an architecture.
 
@@ -84,39 +91,37 @@ def compile_shared(
             (work / "source").mkdir()
             shutil.copy(source, work / "source")
         argv = ["env", "-C", "/out/source", "gcc", "-O2", "-shared", "-fPIC", "-s", "-Wl,--build-id=none", *options]
-        command(work, architecture, [*argv, "-o", "/out/plugin.so", *files, "-lm"], run)
+        command(work, system, [*argv, "-o", "/out/plugin.so", *files, "-lm"], run)
         return (work / "plugin.so").read_bytes()
 
 
-def check_plugins(directory: Path, architecture: str) -> None:
+def check_plugins(directory: Path, system: System) -> None:
     """Let the runtime judge plug-ins: the interface that they were made for, names that are taken.
 
-    It runs on this computer as a robot of the plug-ins' `architecture` has it; so does it below.
+    It runs on this computer as a robot of the plug-ins' `system` has it; so does it below.
     """
-    done = _run(architecture, "flotilla-blocks", "--blocks", str(directory))
+    done = _run(system, "flotilla-blocks", "--blocks", str(directory))
     if done.returncode:
         raise UserError(done.stderr.replace(f"{directory}/", "").strip())
 
 
-def check_task(path: Path, content: bytes, plugins: Path | None = None, architecture: str = "amd64") -> None:
+def check_task(path: Path, content: bytes, plugins: Path | None = None, system: System = HOST) -> None:
     """Let the runtime judge a task as the robot would; UserError with all that is wrong in `path`.
 
-    `plugins`: a directory with blocks that the runtime lacks, for `architecture`.
+    `plugins`: a directory with blocks that the runtime lacks, for `system`.
     """
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".task-") as directory:
         file = Path(directory) / path.name
         file.write_bytes(content)
-        directories = ":".join(
-            str(each) for each in (plugins, _programs(architecture) / "usr/lib/flotilla/blocks") if each
-        )
-        done = _run(architecture, "flotilla-run", "--check", "--blocks", directories, str(file))
+        directories = ":".join(str(each) for each in (plugins, _programs(system) / "usr/lib/flotilla/blocks") if each)
+        done = _run(system, "flotilla-run", "--check", "--blocks", directories, str(file))
         if done.returncode:
             raise UserError(done.stderr.replace(str(file), paths.shown(path)).strip())
 
 
-def _programs(architecture: str) -> Path:
+def _programs(system: System) -> Path:
     """The runtime, unpacked."""
-    made = build(architecture)
+    made = build(system)
 
     def unpack(out: Path) -> None:
         subprocess.run(["dpkg-deb", "-x", str(made.package), str(out)], check=True)
@@ -124,12 +129,12 @@ def _programs(architecture: str) -> Path:
     return cache.result("runtime-programs", made.directory.name.removeprefix("runtime-"), unpack)
 
 
-def _run(architecture: str, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def _run(system: System, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a program of the runtime on this computer, whatever libraries that has."""
-    tree = tools.tree(read_lock(f"runtime-{architecture}"))
-    loader, libraries = _LOADERS[architecture]
-    argv = [str(tree / loader), "--library-path", str(tree / libraries)]
-    argv += [str(_programs(architecture) / "usr/bin" / program), *arguments]
+    tree = tools.tree(read_lock(runtime_lock(system)))
+    loader, directory = _LOADERS[system.architecture]
+    argv = [str(tree / loader), "--library-path", str(tree / directory)]
+    argv += [str(_programs(system) / "usr/bin" / program), *arguments]
     return subprocess.run(argv, capture_output=True, encoding="utf-8", check=False)
 
 
@@ -140,16 +145,16 @@ def sources() -> list[Path]:
     )
 
 
-def key(architecture: str) -> str:
+def key(system: System) -> str:
     """Hash of all that decides the packages' bytes."""
     made_by = [Path(runtime_stage.__file__), Path(runtime_stage.__file__).with_name("chroot.py")]
     names = "\n".join(str(path.relative_to(SOURCE)) for path in sources())
-    return cache.digest(read_lock(f"runtime-{architecture}").digest, names, *sources(), *made_by)
+    return cache.digest(read_lock(runtime_lock(system)).digest, names, *sources(), *made_by)
 
 
-def build(architecture: str) -> Runtime:
-    """The runtime for Debian's `architecture`; from the cache where nothing changed."""
-    lock = read_lock(f"runtime-{architecture}")
+def build(system: System) -> Runtime:
+    """The runtime for `system`; from the cache where nothing changed."""
+    lock = read_lock(runtime_lock(system))
 
     def make(out: Path) -> None:
         pool.fill([lock])
@@ -158,13 +163,13 @@ def build(architecture: str) -> Runtime:
             place = out / "source" / path.relative_to(SOURCE)
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, place)
-        log = paths.BUILD / f"runtime-{architecture}.log"
+        log = paths.BUILD / f"{runtime_lock(system)}.log"
         log.unlink(missing_ok=True)  # an earlier build's
-        with progress.step(f"runtime for {architecture}", lambda: far(progress.text(log))):
-            arguments = [str(tree), str(out), architecture, str(lock.epoch), json.dumps(LIBRARIES)]
+        with progress.step(f"runtime for {system}", lambda: far(progress.text(log))):
+            arguments = [str(tree), str(out), system.architecture, str(lock.epoch), json.dumps(libraries(system))]
             namespace.run_stage(runtime_stage.__name__, arguments, log)
 
-    return Runtime(cache.result("runtime", key(architecture), make))
+    return Runtime(cache.result("runtime", key(system), make))
 
 
 def far(log: str) -> progress.Far:

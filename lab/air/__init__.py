@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from flotilla.fleet.model import System
 from images.builder import runtime
 
 HERE = Path(__file__).parent
@@ -20,7 +21,7 @@ MAILBOX_BYTES = 1 << 20
 """As lockstep.h has it."""
 
 
-def compiled(sources: tuple[str, ...], architecture: str) -> bytes:
+def compiled(sources: tuple[str, ...], system: System) -> bytes:
     """A shared object of these."""
     options = ["-std=gnu11", *runtime.WARNINGS, "-fvisibility=hidden"]
-    return runtime.compile_shared(HERE, sources, architecture, options)
+    return runtime.compile_shared(HERE, sources, system, options)

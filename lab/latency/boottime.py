@@ -90,7 +90,7 @@ def _boot_card(measured: subject.Subject, emulator: machine.Emulator, out: Path)
         nodes += [Node(path) for path in parents]
         nodes += [Node(PurePosixPath(path), content, mode) for path, (mode, content) in files.items()]
         card.begin(made.base, image)
-        card.complete(made.tools, image, sorted(nodes, key=lambda node: node.path.parts), made.lock.epoch)
+        card.complete(made.board, made.tools, image, sorted(nodes, key=lambda node: node.path.parts), made.lock.epoch)
     qemu.make_overlay(image, overlay, qemu.CARD_BYTES)
     argv = machine.card_command_line(emulator, board, overlay, out / "console.log", out / "results")
     found = machine.execute(emulator, argv, out, _TIMEOUT_S)

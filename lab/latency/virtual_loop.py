@@ -160,7 +160,7 @@ def run(board: Board, out: Path) -> dict[str, str]:
         "alone.yml": WATCHED.encode(),
         "watched.yml": WATCHED.encode(),
         "drive.py": DRIVE.encode(),
-        "loopback.so": runtime.compile_plugin(PLUGIN, board.architecture),
+        "loopback.so": runtime.compile_plugin(PLUGIN, board.system),
     }
     files |= {name: (paths.PROJECT / name).read_bytes() for name in EMULATOR}
     files |= flood.files(board, DIRECTORY)

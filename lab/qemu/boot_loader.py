@@ -105,6 +105,7 @@ class BootLoader(StubComputer):
     ) -> None:
         """`unreadable`: offsets on the card of sectors that fail when read; `head`: instead of the card's."""
         directory.mkdir(parents=True, exist_ok=True)
+        self.board = board
         self._disk = directory / "disk"
         with self._disk.open("wb") as disk:
             disk.truncate(card.SIZE)

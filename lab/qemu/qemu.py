@@ -23,6 +23,9 @@ from flotilla.fleet.model import Board, Network
 CARD_BYTES = 1_000_000_000
 """What a card sold as 1 GB holds at least; larger than the images, so that the first boot grows the data partition."""
 
+UEFI_PLACES = (Path("/usr/share/ovmf/OVMF.fd"), Path("/usr/share/qemu/OVMF.fd"))
+"""Where distributions have the firmware that needs no file for its settings."""
+
 _VIRTUAL_START = datetime(2026, 1, 1)
 
 # Chardev backends: the text after `-chardev` without the id.
@@ -112,6 +115,8 @@ def command_line(board: Board, card: Path, options: Options) -> list[str]:
     """The whole command, ready to run. `card`: overlay of the card image, see `make_overlay`."""
     argv = [program(board), "-name", options.name, "-nodefaults", "-no-user-config", "-display", "none"]
     argv += ["-machine", board.qemu.machine, "-cpu", board.qemu.cpu, "-m", str(board.qemu.memory_mib)]
+    if board.firmware == "uefi":
+        argv += ["-bios", uefi_firmware()]
     if options.virtual_time:
         # One thread, fixed seed and clock: tried to repeat to the byte, see the facts on testing networks.
         argv += ["-accel", "tcg,thread=single", "-icount", "shift=3,sleep=off", "-machine", "hpet=off,usb=off"]
@@ -155,6 +160,16 @@ def virtual_s(execute: Callable[..., Any]) -> float:
 def program(board: Board) -> str:
     """The emulator for the board."""
     return find_tool(f"qemu-system-{board.qemu.system}")
+
+
+def uefi_firmware() -> str:
+    """QEMU's firmware for boards with UEFI. What it keeps of its settings ends with QEMU."""
+    if found := next((place for place in UEFI_PLACES if place.is_file()), None):
+        return str(found)
+    raise UserError(
+        "OVMF.fd, by which QEMU has UEFI, is missing on this computer; install it: "
+        "sudo apt-get install --no-install-recommends ovmf"
+    )
 
 
 def find_tool(name: str) -> str:

@@ -28,6 +28,7 @@ from flotilla.fleet import identity
 from flotilla.fleet.model import Board, Fleet, Robot
 from images.builder import data_partition, runtime
 from images.builder.filesystem import Node
+from images.builder.lock import HOST
 from lab import air
 from lab.latency import computable_keys, machine, results, subject
 from lab.qemu import qemu
@@ -66,7 +67,7 @@ def members(plan: Plan, fleet: Fleet, board: Board, keys: Path) -> list[Member]:
     """The flying robot's guest first, which has the station's radio, too."""
     flying = fleet.robot_with("valves")
     robots = sorted(fleet.robots.values(), key=lambda robot: robot != flying)
-    library = air.compiled(air.MEMBER, board.architecture)
+    library = air.compiled(air.MEMBER, board.system)
     programs = ("fly.py", "member.py")
     common = {f"{DIRECTORY}/lab/scenarios/{name}": (HERE / name).read_bytes() for name in programs} | {_MEMBER: library}
     found, radios = [], 0
@@ -114,7 +115,7 @@ def _session(plan: Plan, fleet: Fleet, board: Board, robot: Robot, radios: tuple
 
 def _of_the_station(plan: Plan, fleet: Fleet, board: Board) -> dict[str, bytes]:
     return {
-        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
+        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.system),
         f"{DIRECTORY}/station.yml": virtual.station(fleet),
         f"{DIRECTORY}/plant.yml": virtual.plant(plan, fleet, board),
     }
@@ -135,7 +136,7 @@ def fly(plan: Plan, board: Board, out: Path) -> Flight:
     system = subject.build(board)
     emulator = machine.emulator()
     for name, sources in {"barrier.so": air.BARRIER, "conductor.so": air.CONDUCTOR}.items():
-        (out / name).write_bytes(air.compiled(sources, "amd64"))
+        (out / name).write_bytes(air.compiled(sources, HOST))
     fleet = members(plan, described, board, out / "keys")
     console = out / fleet[0].robot.name / machine.CONSOLE
     title = f"{plan.name}: {len(fleet)} guests in lock-step"

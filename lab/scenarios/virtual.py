@@ -271,9 +271,9 @@ def files(plans: Sequence[Plan], board: Board, keys: Path) -> dict[str, bytes]:
     """What enters the guest: by path."""
     described = fleet("udp", board=board)
     there = {
-        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
+        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.system),
         f"{DIRECTORY}/stranger.py": (HERE / "stranger.py").read_bytes(),
-        AIR: air.compiled(air.ONE_GUEST, board.architecture),
+        AIR: air.compiled(air.ONE_GUEST, board.system),
     }
     flights = []
     for plan in plans:

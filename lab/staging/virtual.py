@@ -211,9 +211,9 @@ def stage(board: Board, kbit_s: int, out: Path) -> Staged:
     }  # fmt: skip
     files = brought.files | {
         f"{DIRECTORY}/task.yml": CHAIN.format(device=f"/dev/{board.ports[port].tty}").encode(),
-        f"{DIRECTORY}/loopback.so": runtime.compile_plugin(PLUGIN, board.architecture),
+        f"{DIRECTORY}/loopback.so": runtime.compile_plugin(PLUGIN, board.system),
         f"{DIRECTORY}/heartbeat.yml": (paths.TASKS / "heartbeat.yml").read_bytes(),
-        OVERRUN_THERE: runtime.compile_plugin(OVERRUN, board.architecture),
+        OVERRUN_THERE: runtime.compile_plugin(OVERRUN, board.system),
         f"{DIRECTORY}/guest.py": (HERE / "guest.py").read_bytes(),
         f"{DIRECTORY}/session.json": json.dumps(session).encode(),
     }

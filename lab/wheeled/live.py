@@ -360,7 +360,7 @@ def _bring(live: Live, fleet: Fleet, index: int, there: Plant) -> None:
     task = plant.task(there, DRIVES, LASER, station=station, room=Room(one.robot.number, others))
     with progress.step(f"plant of {one.robot.name}"):
         one.shell.run(["mkdir", "-p", _THERE])
-        one.shell.write(f"{_THERE}/plant.so", runtime.compile_plugin(PLANT, board.architecture))
+        one.shell.write(f"{_THERE}/plant.so", runtime.compile_plugin(PLANT, board.system))
         one.shell.write(f"{_THERE}/plant.yml", yaml.safe_dump(task).encode())
         one.shell.run(["sudo", "sh", "-c", _BEGIN], timeout=BEGIN_SECONDS)
         live.until(lambda: live.truth(index) and live.report(index).get("seeing"), BEGIN_SECONDS, "the plant begins")

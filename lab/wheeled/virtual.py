@@ -150,7 +150,7 @@ def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str
     robot = described.robot_with("drive")
     tasks = identity.control_tasks(described, robot)
     there = {
-        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.architecture),
+        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.system),
         f"{DIRECTORY}/guest.py": (HERE / "guest.py").read_bytes(),
     }
     there |= {f"{DIRECTORY}/{name}.yml": _believing(tasks[name]) for name in TASKS}

@@ -17,6 +17,8 @@
 enum {
     MBR_TABLE = 446,
     MBR_ENTRY = 16,
+    MBR_GPT = 0xee,  /* type of the one partition that protects a GPT */
+    GPT_ENTRY = 128, /* UEFI specification 2.10, tables 5.5 and 5.6 */
     TAR_CHECKSUM = 148,
 };
 
@@ -49,22 +51,45 @@ static bool write_sectors(const struct boot_card *card, int64_t offset, const vo
     return true;
 }
 
+/* Where the partitions lie; false where the sectors hold no table. */
+static bool read_partitions(struct boot_card *card)
+{
+    unsigned char sectors[3 * BOOT_SECTOR] ALIGNED, *mbr = sectors, *header = sectors + BOOT_SECTOR;
+    if (!read_sectors(card, 0, sectors, sizeof sectors) || mbr[510] != 0x55 || mbr[511] != 0xaa)
+        return false;
+    bool gpt = mbr[MBR_TABLE + 4] == MBR_GPT;
+    /* GRUB looks no further either, and where it found its state, this must. */
+    if (gpt && memcmp(header, "EFI PART", 8) != 0)
+        return false;
+    for (int i = 0; i < BOOT_PARTITIONS; i++) {
+        if (gpt) {
+            uint64_t lbas[2]; /* first and last */
+            memcpy(lbas, header + BOOT_SECTOR + (size_t)i * GPT_ENTRY + 32, sizeof lbas);
+            for (int end = 0; end < 2; end++)
+                lbas[end] = le64toh(lbas[end]);
+            if (lbas[1] >= INT64_MAX / BOOT_SECTOR || lbas[0] > lbas[1])
+                return false;
+            card->start[i] = (int64_t)lbas[0] * BOOT_SECTOR;
+            card->size[i] = (int64_t)(lbas[1] + 1 - lbas[0]) * BOOT_SECTOR;
+        } else {
+            uint32_t words[2]; /* first and number */
+            memcpy(words, mbr + MBR_TABLE + (size_t)i * MBR_ENTRY + 8, sizeof words);
+            card->start[i] = (int64_t)le32toh(words[0]) * BOOT_SECTOR;
+            card->size[i] = (int64_t)le32toh(words[1]) * BOOT_SECTOR;
+        }
+    }
+    return true;
+}
+
 bool boot_open(struct boot_card *card, const char *path, char *reason, int size)
 {
-    unsigned char mbr[BOOT_SECTOR] ALIGNED;
     *card = (struct boot_card){.fd = open(path, O_RDWR | O_CLOEXEC | O_DIRECT)};
     if (card->fd < 0 && errno == EINVAL) /* a file system that knows no direct access */
         card->fd = open(path, O_RDWR | O_CLOEXEC);
     if (card->fd < 0)
         return fail(reason, size, "%s: %s", path, strerror(errno));
-    if (!read_sectors(card, 0, mbr, BOOT_SECTOR) || mbr[510] != 0x55 || mbr[511] != 0xaa)
+    if (!read_partitions(card))
         return fail(reason, size, "%s has no partition table of a card", path);
-    for (int i = 0; i < BOOT_PARTITIONS; i++) {
-        uint32_t words[2];
-        memcpy(words, mbr + MBR_TABLE + (size_t)i * MBR_ENTRY + 8, sizeof words);
-        card->start[i] = (int64_t)le32toh(words[0]) * BOOT_SECTOR;
-        card->size[i] = (int64_t)le32toh(words[1]) * BOOT_SECTOR;
-    }
     if (card->size[0] < (1 + BOOT_COPIES) * BOOT_REGION)
         return fail(reason, size, "%s has another layout: its first partition holds no boot state", path);
     return true;

@@ -72,7 +72,9 @@ def test_damaged_slot_falls_back_and_a_hang_ends(fresh_guest: GuestFactory, tmp_
     robot.wait_booted()
     sh(robot, "systemctl is-system-running --wait", check=False)
     words = sh(robot, "cat /proc/cmdline").split()
-    assert {"flotilla.slot=B", f"root=PARTUUID={card.SLOTS[1].partuuid}"} <= set(words), f"booted {' '.join(words)}"
+    assert {"flotilla.slot=B", f"root=PARTUUID={card.SLOTS[1].partuuid(robot.board)}"} <= set(words), (
+        f"booted {' '.join(words)}"
+    )
     assert re.search(r"sd.3$", sh(robot, "findmnt -n -o SOURCE /"))
     state = boot_state(robot)
     assert {name: state["slots"][name]["ok"] for name in "AB"} == {"A": False, "B": True}

@@ -287,7 +287,7 @@ def bring_firewire(robot: RobotGuest) -> None:
     """A library with a camera, because QEMU has no FireWire."""
     options = ["-std=c11", *runtime.WARNINGS, "-pthread"]
     source = runtime.SOURCE / "tests/camera"
-    library = runtime.compile_shared(source, ["dc1394_bus.c", "dc1394_camera.c"], robot.board.architecture, options)
+    library = runtime.compile_shared(source, ["dc1394_bus.c", "dc1394_camera.c"], robot.board.system, options)
     robot.shell.run(["mkdir", str(FIREWIRE)])
     robot.shell.write(str(FIREWIRE / "libdc1394.so.25"), library)
     robot.shell.run(["touch", str(FIREWIRE / "plug")])

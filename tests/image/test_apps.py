@@ -56,7 +56,13 @@ def test_apps_have_the_same_bytes_wherever_built_and_lie_on_the_card(tmp_path: P
         finally:
             os.umask(before)
         image = tmp_path / f"{umask}.img"
-        card.data_partition(toolset, image, data_partition.nodes(fleet, robot, made), read_lock("smartcoret3").epoch)
+        card.data_partition(
+            fleet.boards[robot.board],
+            toolset,
+            image,
+            data_partition.nodes(fleet, robot, made),
+            read_lock("smartcoret3").epoch,
+        )
         partitions.append((made, image))
     (first, image), (second, other) = partitions
     assert [each.listing for each in first] == [each.listing for each in second]

@@ -160,11 +160,17 @@ def _partition_table(image: Path) -> list[tuple[int, int, int, int]]:
 
 
 def test_partition_table(robot_card: Card) -> None:
+    if robot_card.board.firmware == "uefi":
+        assert _partition_table(robot_card.image)[:2] == [(0, 0xEE, 1, card.SIZE // 512 - 1), (0, 0, 0, 0)]
+        return
     expected = [
         (0x80 if partition is card.STATE else 0, kind, partition.start // 512, partition.size // 512)
         for partition, kind in zip((card.STATE, *card.SLOTS, card.DATA), (0xDA, 0x83, 0x83, 0x83), strict=True)
     ]
     assert _partition_table(robot_card.image) == expected
+
+
+def test_an_image_has_the_size_of_a_card(robot_card: Card) -> None:
     assert robot_card.image.stat().st_size == card.SIZE
 
 
@@ -175,17 +181,34 @@ def test_an_image_is_its_owners_alone(robot_card: Card) -> None:
 
 def test_partition_table_as_another_program_reads_it(robot_card: Card) -> None:
     table = json.loads(robot_card.tools.run("usr/sbin/sfdisk", "--json", robot_card.image))["partitiontable"]
-    assert table["label"] == "dos"
-    assert table["id"] == f"0x{card.LAYOUT.disk_id:08x}"
-    bootable = [partition.get("bootable", False) for partition in table["partitions"]]
-    assert bootable == [True, False, False, False], f"bootable flags: {bootable}"
-    ends = [partition["start"] + partition["size"] for partition in table["partitions"]]
-    starts = [partition["start"] for partition in table["partitions"]]
+    found = table["partitions"]
+    if robot_card.board.firmware == "uefi":
+        assert (table["label"], table["id"].lower()) == ("gpt", "464c4f54-0000-4000-8000-000000000000")
+        assert [one["name"] for one in found] == ["state", "A", "B", "data", "system"]
+        assert [one["uuid"].lower() for one in found] == [
+            f"464c4f54-0000-4000-8000-{number:012}" for number in range(1, 6)
+        ]
+        assert "No errors detected" in robot_card.tools.run("usr/sbin/sfdisk", "--verify", robot_card.image)
+    else:
+        assert (table["label"], table["id"]) == ("dos", f"0x{card.LAYOUT.disk_id:08x}")
+        bootable = [partition.get("bootable", False) for partition in found]
+        assert bootable == [True, False, False, False], f"bootable flags: {bootable}"
+    places = sorted((one["start"] * 512, one["size"] * 512) for one in found)
+    assert places == [(one.start, one.size) for one in card.partitions(robot_card.board)]
+    ends, starts = [sum(place) for place in places], [start for start, _ in places]
     assert all(end <= start for end, start in zip(ends, starts[1:], strict=False)), f"overlap: {table}"
 
 
-def test_boot_code_is_in_place(robot_card: Card) -> None:
-    """GRUB's first stage, and the second right behind it."""
+def test_boot_code_is_in_place(robot_card: Card, tmp_path: Path) -> None:
+    """GRUB's first stage, and the second right behind it; for UEFI a program where firmware looks for one."""
+    if robot_card.board.firmware == "uefi":
+        system = robot_card.cut(card.SYSTEM, tmp_path / "system")
+        robot_card.tools.run("usr/sbin/fsck.fat", "-n", system)
+        robot_card.tools.run("usr/bin/mcopy", "-i", system, "::EFI/BOOT/BOOTX64.EFI", tmp_path / "program")
+        program = (tmp_path / "program").read_bytes()
+        (pe,) = struct.unpack_from("<I", program, 0x3C)
+        assert (program[:2], program[pe : pe + 6]) == (b"MZ", b"PE\0\0\x64\x86"), "no program for amd64"
+        return
     first = (robot_card.tools.directory / "usr/lib/grub/i386-pc/boot.img").read_bytes()[:440]
     with robot_card.image.open("rb") as file:
         head = file.read(1024)

@@ -16,6 +16,7 @@ import pytest
 from flotilla.apps import ert, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from images.builder.lock import HOST
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def change(file: Path, old: str, new: str) -> None:
 def read(generated: Path, times_s: list[float] | None = None) -> ert.Model:
     out = generated.parent / "read"
     code = ert.collect(generated, "sample", out)
-    return ert.read("sample", ert.preprocess(out, "sample", code, "amd64"), code, times_s or [])
+    return ert.read("sample", ert.preprocess(out, "sample", code, HOST), code, times_s or [])
 
 
 def test_ports_parameters_and_rates_are_the_models(generated: Path) -> None:
@@ -164,7 +165,7 @@ def test_rates_that_the_code_does_not_tell(generated: Path) -> None:
 
 def test_files_that_are_missing(generated: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"generated/other\.h is missing; generated/ holds what Embedded Coder made"):
-        ert.block(generated.parent, "other", "sample", [], tmp_path / "out", "amd64")
+        ert.block(generated.parent, "other", "sample", [], tmp_path / "out", HOST)
 
 
 def run(
@@ -172,7 +173,7 @@ def run(
 ) -> list[dict[str, float]]:
     """The values of signals in each step of a task that uses the block `sample`."""
     out = generated.parent / "source"
-    ert.block(generated.parent, "sample", "sample", [], out, "amd64", tasking)
+    ert.block(generated.parent, "sample", "sample", [], out, HOST, tasking)
     (generated.parent / "blocks").mkdir()
     warnings = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-O2"]
     argv = ["cc", *warnings, "-shared", "-fPIC", f"-I{paths.PROJECT / 'runtime' / 'include'}", "-o"]
@@ -262,4 +263,4 @@ def test_a_model_of_one_rate_is_held_to_the_period_that_its_main_program_says(
     with pytest.raises(AssertionError, match=r"generated for a period of 20\.0 ms, and runs each 10 ms"):
         run(flotilla_run, generated, TASK, 1, "plain.command")
     code = ert.collect(generated, "sample", out := tmp_path / "collected")
-    assert ert.read("sample", ert.preprocess(out, "sample", code, "amd64"), code, [0.01]).period_s == 0.01
+    assert ert.read("sample", ert.preprocess(out, "sample", code, HOST), code, [0.01]).period_s == 0.01

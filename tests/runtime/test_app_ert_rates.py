@@ -14,6 +14,7 @@ import pytest
 from flotilla.apps import ert
 from flotilla.common.errors import UserError
 from images.builder import runtime
+from images.builder.lock import HOST
 from tests.fixtures import ert_rates
 
 TASK = """\
@@ -53,7 +54,7 @@ class Bench:
         return self.work / "app" / ert.GENERATED
 
     def block(self, tasking: str | None = None) -> None:
-        ert.block(self.work / "app", "three", "three", [], self.work / "source", "amd64", tasking)
+        ert.block(self.work / "app", "three", "three", [], self.work / "source", HOST, tasking)
 
     def run(
         self, *options: str, busy: int = 0, priority: int = 0, overrun: str = "skip", tasking: str | None = None,
@@ -161,7 +162,7 @@ def test_threads_that_the_code_does_not_permit_are_refused(bench: Bench) -> None
             text += "void three_others(int tid)\n{\n  if (tid == 1)\n    rate_1();\n  else\n    rate_2();\n}\n"
         (bench.generated / name).write_text(text)
     code = ert.collect(bench.generated, "three", out := bench.work / "read")
-    model = ert.read("three", ert.preprocess(out, "three", code, "amd64"), code, [0.01, 0.02, 0.06])
+    model = ert.read("three", ert.preprocess(out, "three", code, HOST), code, [0.01, 0.02, 0.06])
     assert [step.number for step in model.steps] == [0, 1, 2]
     with pytest.raises(UserError, match=r"three\.c: tasking: threads: has no function three_step0; one function for"):
         ert.separate(model, code, wanted=True)

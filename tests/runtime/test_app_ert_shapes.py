@@ -16,6 +16,7 @@ from flotilla.apps import app, builder, ert
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
 from images.builder import runtime
+from images.builder.lock import HOST
 from tests.fixtures.ert_shapes import SHAPES, Shape, write
 from tests.running import running
 
@@ -60,7 +61,7 @@ def build(shape: Shape, work: Path) -> Path:
 def compiled(shape: Shape, work: Path) -> Path:
     """The same, of code that was written."""
     out, blocks = work / "source", work / "blocks"
-    ert.block(work / "app", shape.model, "model", [], out, "amd64")
+    ert.block(work / "app", shape.model, "model", [], out, HOST)
     blocks.mkdir()
     options = [
         "-std=c11",

@@ -23,6 +23,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
 from images.builder import runtime
+from images.builder.lock import HOST
 from tests.running import running
 
 TWO_LAGS = paths.PROJECT / "tests/fixtures/fmu"
@@ -58,8 +59,8 @@ def build(directory: Path) -> Path:
     fmu.block(unit, name, out / "source")
     (out / "blocks").mkdir()
     strict = (*runtime.WARNINGS, "-Wconversion", "-Wshadow")
-    (out / "blocks" / f"{name}.so").write_bytes(runtime.compile_plugin(out / "source", "amd64", strict))
-    fmu.build(unit, name, "amd64", out)
+    (out / "blocks" / f"{name}.so").write_bytes(runtime.compile_plugin(out / "source", HOST, strict))
+    fmu.build(unit, name, HOST, out)
     return out / "blocks"
 
 
@@ -81,7 +82,7 @@ def run(
 def make_binary(directory: Path, version: str) -> None:
     """The app's unit as tools export it: packed, its sources compiled."""
     unit, made = read(directory), directory.parent / "made"
-    fmu.build(unit, "made", "amd64", made)
+    fmu.build(unit, "made", HOST, made)
     place = directory / "unit" / BINARIES[version].format(unit.identifier)
     place.parent.mkdir(parents=True)
     shutil.copyfile(made / fmu.object_of("made"), place)
@@ -338,7 +339,9 @@ def test_a_binary_is_taken_where_sources_are_not_there_or_not_c(flotilla_run: Pa
     (unit / fmu.DESCRIPTION).write_text(description)
     assert "reference.c" in description
     with pytest.raises(UserError, match=r"SourceFiles: reference\.c: is not there"):
-        fmu.build(read(apps["reference"]), "reference", "i386", apps["reference"].parent / "none")
+        fmu.build(
+            read(apps["reference"]), "reference", HOST._replace(architecture="i386"), apps["reference"].parent / "none"
+        )
     task = "period: 100 ms\npriority: 0\nblocks:\n  model: {type: reference}\n"
     rows = run(flotilla_run, build(apps["reference"]), task, steps=10, watch="model.counter")
     assert rows[-1]["model.counter"] == 2
@@ -496,7 +499,7 @@ BAD = {
 def test_what_cannot_become_a_block_is_said(apps: dict[str, Path], version: str, old: str, new: str, said: str) -> None:
     change(apps[version] / "unit" / fmu.DESCRIPTION, old, new)
     with pytest.raises(UserError) as refused:
-        fmu.sources(read(apps[version]), "amd64")
+        fmu.sources(read(apps[version]), HOST)
     assert f"{apps[version]}/unit/modelDescription.xml" in str(refused.value)
     assert said in str(refused.value)
 
@@ -522,7 +525,7 @@ BAD_BUILD = {
 def test_sources_that_cannot_be_compiled_are_said(apps: dict[str, Path], old: str, new: str, said: str) -> None:
     change(apps["3"] / "unit" / "sources" / "buildDescription.xml", old, new)
     with pytest.raises(UserError) as refused:
-        fmu.sources(read(apps["3"]), "amd64")
+        fmu.sources(read(apps["3"]), HOST)
     assert "two-lags/unit/sources/buildDescription.xml: " in str(refused.value)
     assert said in str(refused.value)
 
@@ -531,14 +534,14 @@ def test_a_binary_for_another_architecture(apps: dict[str, Path]) -> None:
     make_binary(apps["2"], "2")
     unit = read(apps["2"])
     with pytest.raises(UserError) as refused:
-        fmu.binary(unit, "i386")
+        fmu.binary(unit, HOST._replace(architecture="i386"))
     assert "exported.fmu/binaries/linux32/lag.so: is missing, and the robot is an i386; there are" in str(refused.value)
     (unit.directory / "binaries" / "linux64").rename(unit.directory / "binaries" / "linux32")
     with pytest.raises(UserError, match=r"linux32/lag\.so: is for amd64, not for i386; export it anew"):
-        fmu.binary(unit, "i386")
+        fmu.binary(unit, HOST._replace(architecture="i386"))
     (unit.directory / "binaries" / "linux32" / "lag.so").write_text("MZ")
     with pytest.raises(UserError, match=r"linux32/lag\.so: is no shared object for a PC, not for i386"):
-        fmu.binary(unit, "i386")
+        fmu.binary(unit, HOST._replace(architecture="i386"))
 
 
 def test_a_unit_that_is_too_large(apps: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ import pytest
 from flotilla.apps import ert
 from flotilla.common import paths
 from images.builder import runtime
+from images.builder.lock import HOST
 
 INCLUDE = f"-I{paths.PROJECT / 'runtime' / 'include'}"
 RTWTYPES = paths.PROJECT / "examples" / "two-rates" / "generated" / "rtwtypes.h"
@@ -221,7 +222,7 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """The app as `make deploy` makes it, in a task with the same controller outside of the model."""
     out, blocks = app / "source", app / "blocks"
-    ert.block(app, "loop", "loop", [], out, "amd64")
+    ert.block(app, "loop", "loop", [], out, HOST)
     blocks.mkdir()
     argv = ["cc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC", INCLUDE, "-o"]
     subprocess.run([*argv, blocks / "loop.so", *sorted(out.glob("*.c"))], check=True)
@@ -337,7 +338,7 @@ def test_an_inner_actuator_fails_and_is_reset_with_the_task(flotilla_run: Path, 
     assert legacy_code(flotilla_run, generated, *words).returncode == 0
     (generated / "tmwtypes.h").unlink()
     out = app / "source"
-    ert.block(app, "loop", "loop", [], out, "amd64")
+    ert.block(app, "loop", "loop", [], out, HOST)
     argv = ["cc", "-std=c11", "-O2", "-shared", "-fPIC", INCLUDE, "-o", str(blocks / "loop.so")]
     subprocess.run([*argv, *map(str, sorted(out.glob("*.c")))], check=True)
     file = app / "run.yml"

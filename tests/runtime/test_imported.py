@@ -17,6 +17,7 @@ import pytest
 from flotilla.apps import app, ert, imported, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from images.builder.lock import HOST
 from tests.fixtures import ert_rates
 from tests.fixtures.ert_shapes import SHAPES, write
 
@@ -36,7 +37,7 @@ def archive(local_compiler: None, tmp_path: Path) -> Path:
 
 def create(archive: Path, name: str = "three", **more: object) -> Path:
     parent = archive.parent / "apps"
-    imported.create(archive, name, ["amd64"], parent=parent, **more)  # type: ignore[arg-type]
+    imported.create(archive, name, [HOST], parent=parent, **more)  # type: ignore[arg-type]
     return parent / name
 
 
@@ -44,7 +45,7 @@ def test_an_archive_becomes_an_app_that_runs(archive: Path, flotilla_run: Path) 
     made = create(archive)
     assert sorted(file.name for file in (made / ert.GENERATED).iterdir()) == ["rtwtypes.h", "three.c", "three.h"]
     assert (made / app.FILE).read_text() == "kind: ert\nmodel: three\n"
-    ert.block(made, "three", "three", [], source := archive.parent / "source", "amd64")
+    ert.block(made, "three", "three", [], source := archive.parent / "source", HOST)
     (blocks := archive.parent / "blocks").mkdir()
     argv = ["cc", "-shared", "-fPIC", f"-I{paths.PROJECT / 'runtime' / 'include'}", "-o", blocks / "three.so"]
     subprocess.run([*map(str, argv), *map(str, source.glob("*.c"))], check=True)

@@ -18,6 +18,7 @@ import pytest
 from flotilla.apps import app, ert, imported
 from flotilla.common import paths
 from images.builder import runtime
+from images.builder.lock import HOST
 from tests.fixtures import ert_rates
 
 STUBS = paths.PROJECT / "tests" / "fixtures" / "octave"
@@ -186,10 +187,10 @@ def test_a_build_is_packed_sent_imported_and_deployed(station: Octave, local_com
     assert options["packType"] == "flat"
     assert not Path(options["fileName"]).parent.exists(), "the archive is left on this computer"
     assert not list((station.work / "home").glob("*.zip")) + list((there / "build").iterdir())
-    imported.create(there / "imported.zip", "three", ["amd64"], "three", parent=tmp_path / "apps")
+    imported.create(there / "imported.zip", "three", [HOST], "three", parent=tmp_path / "apps")
     made = app.load(tmp_path / "apps" / "three")
     assert isinstance(made.description, app.Ert)
-    ert.block(made.directory, "three", "three", [], tmp_path / "source", "amd64")
+    ert.block(made.directory, "three", "three", [], tmp_path / "source", HOST)
     argv = ["cc", "-std=c11", "-Wall", "-Werror", "-fsyntax-only", f"-I{runtime.SOURCE / 'include'}"]
     subprocess.run([*argv, *map(str, (tmp_path / "source").glob("*.c"))], check=True)
 

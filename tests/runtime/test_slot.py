@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import random
+import struct
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,10 +14,12 @@ from typing import Any
 
 import pytest
 
+from flotilla.fleet import inventory
 from images.builder import card, environment_block, slot
 
 COPIES = [card.STATE.start + place for place in card.COPIES]
 TRIES = card.STATE.start + card.TRIES
+PC = next(board for board in inventory.load_fleet().boards.values() if board.firmware == "uefi")
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,30 @@ def partition_table() -> bytes:
         for each in (card.STATE, *card.SLOTS, card.DATA)
     )
     return bytes(446) + entries + b"\x55\xaa"
+
+
+def gpt() -> bytes:
+    """The MBR that protects a GPT, its header, and entries; the program looks at nothing else (UEFI 2.10, 5.3)."""
+    parts = sorted(card.partitions(PC), key=lambda one: one.number)
+    entries = b"".join(
+        bytes(32) + struct.pack("<QQ", one.start // 512, one.end // 512 - 1) + bytes(80) for one in parts
+    )
+    return bytes(450) + b"\xee" + bytes(59) + b"\x55\xaa" + b"EFI PART".ljust(512, b"\0") + entries
+
+
+def test_a_card_with_a_gpt(new: Card) -> None:
+    """Partitions are where it says, whatever order they lie in. Seen to fail where the MBR's entries are read."""
+    before = new.do("show")
+    new.write(0, gpt())
+    assert new.do("show") == before
+    new.count(1, a=2)
+    assert new.do("started")["slots"]["A"]["tries"] == 0
+    assert [new.read(place) for place in COPIES] == [card.state_copy(2)] * 2
+    for damage in (b"EFI PARX", gpt()[512:1024] + bytes(40) + b"\xff" * 8):
+        new.write(512, damage)
+        refused = new.run("show")
+        assert refused.returncode
+        assert "has no partition table of a card" in refused.stderr
 
 
 def test_a_new_card_needs_nothing(new: Card) -> None:

@@ -91,6 +91,16 @@ def test_machine_is_the_boards_and_nothing_else() -> None:
     assert command_line(board(system="x86_64"))[0].endswith("/qemu-system-x86_64")
 
 
+def test_a_board_with_uefi_has_its_firmware(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert values(command_line(board()), "-bios") == []
+    pc = board().model_copy(update={"firmware": "uefi"})
+    monkeypatch.setattr(qemu, "UEFI_PLACES", (tmp_path / "OVMF.fd",))
+    with pytest.raises(UserError, match=r"OVMF\.fd.*missing on this computer.*apt-get install.* ovmf"):
+        command_line(pc)
+    (tmp_path / "OVMF.fd").touch()
+    assert values(command_line(pc), "-bios") == [str(tmp_path / "OVMF.fd")]
+
+
 @pytest.mark.parametrize(
     ("disk", "machine", "devices"),
     [

@@ -139,8 +139,9 @@ def test_it_is_known_before_a_robot_has_it(own: Path, board: Board) -> None:
 def test_its_lock_is_resolved_alone(own: Path, fleet: Fleet, keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lock, "_KEYRINGS", (keys / "trusted.gpg",))
     (own / "packages/robot.list").write_text("tool # needed\n")
+    (own / "packages/robot-bookworm.list").write_text("")
     recipes = lock.recipes(fleet.boards.values())
-    assert recipes[NAME] == lock.Recipe("bookworm", "i386", ("robot", NAME))
+    assert recipes[NAME] == lock.Recipe("bookworm", "i386", ("robot", "robot-bookworm", NAME))
     before = _hashes(own / "locks")
     said = lock.update_locks(lock.chosen(recipes, [NAME]), Archive(own / "archive", keys, "i386").write())
     assert said.startswith("vortex: 6 packages")
@@ -170,7 +171,7 @@ def test_its_card_boots_it(board: Board) -> None:
     assert card.kernel_arguments(board) == arguments
     partitions = [card.STATE, *card.SLOTS, card.DATA]
     assert [one.end for one in partitions] == [*(one.start for one in partitions[1:]), card.SIZE]
-    assert [one.partuuid for one in partitions] == [f"464c4f54-0{number}" for number in (1, 2, 3, 4)]
+    assert [one.partuuid(board) for one in partitions] == [f"464c4f54-0{number}" for number in (1, 2, 3, 4)]
 
 
 def test_its_robot_gets_its_ports_and_modules(fleet: Fleet) -> None:

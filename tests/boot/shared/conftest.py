@@ -28,10 +28,7 @@ _STANDING[_FLEET.robots[PENTIUM].board] = PENTIUM
 """The robots that stand for their boards: the first one each, but for that one."""
 SYSTEMS = [
     pytest.param(
-        (number, "debian"), id=f"{board}-debian",
-        # test_fleet.py boots the others' each time.
-        marks=[] if board == _FLEET.board().name else [pytest.mark.nightly],
-    )
+        (number, "debian"), id=f"{board}-debian")
     for board, number in sorted(_STANDING.items())
 ] + [  # after those whose kernel has not to be built
     pytest.param(
