@@ -8,10 +8,10 @@
  *
  * Failure: The flag is 0 once no measurement came for `timeout`, while the port is closed, and from a measurement on
  * that the gyro marks as a fault or that is beyond `full_scale`. While the flag is 0 the values stay the last good
- * ones, and `age` grows. The increment is 0 instead in a step to which one was bad or lost. After each start, and
- * after a silence, measurements count once the gyro has surely taken the mode. A word counts a millisecond late, once
- * the word after it is right, too: where bytes were lost, halves of two words can look like one. A port that is missing
- * or in use is opened again every 100 ms; the journal says once what is wrong.
+ * ones, and `age` grows. The increment is 0 instead in a step to which a bad one came, or the first one after some that
+ * were lost. After each start, and after a silence, measurements count once the gyro has surely taken the mode. A word
+ * counts a millisecond late, once the word after it is right, too: where bytes were lost, halves of two words can look
+ * like one. A port that is missing or in use is opened again every 100 ms; the journal says once what is wrong.
  */
 #include "dsp3000_frame.h"
 
@@ -128,7 +128,8 @@ static size_t say_mode(void *parser, const void *given, int silent_ms, uint8_t *
     /* After a silence the gyro may have been switched on again, and is then in rate mode. A word that it broke off has
      * no end. */
     if (silent_ms == FL_SERIAL_OPENED || silent_ms > 0) {
-        self->words = (struct dsp3000_words){.mode = (uint8_t)dsp3000->mode};
+        self->words = (struct dsp3000_words){.mode = (uint8_t)dsp3000->mode, .gap = true};
+        self->text.gap = true;
         self->repeats = REPEATS;
         self->settling = SETTLING;
     }
@@ -247,7 +248,7 @@ static void take_newest(struct fl_block *block, enum dsp3000_mode mode)
     fl_sensor_update(&state->sensor, arrived_ns, state->received);
 }
 
-/* Sum up all increments since the last step. A bad or lost increment makes the sum invalid. */
+/* Sum up all increments since the last step. A bad increment, or a lost one before them, makes the sum invalid. */
 static void take_each(struct fl_block *block)
 {
     struct state *state = block->state;
@@ -257,7 +258,7 @@ static void take_each(struct fl_block *block)
     double sum = 0;
     bool good = true;
     while (fl_serial_next(state->serial, &sample, &arrived_ns, &sequence)) {
-        good = good && believable(state, &sample) && sequence == state->received + 1;
+        good = good && believable(state, &sample) && sequence == state->received + 1 && !sample.gap;
         sum += sample.degrees * state->radians;
         state->received = sequence;
         if (good)

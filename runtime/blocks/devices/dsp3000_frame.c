@@ -23,7 +23,7 @@ static bool parse(const char *frame, struct dsp3000_sample *sample)
         return false;
     if (strspn(frame + NUMBER, " ") != VALID - NUMBER || (frame[VALID] != '0' && frame[VALID] != '1'))
         return false;
-    *sample = (struct dsp3000_sample){degrees, frame[VALID] == '1'};
+    *sample = (struct dsp3000_sample){.degrees = degrees, .valid = frame[VALID] == '1'};
     return true;
 }
 
@@ -38,7 +38,10 @@ bool dsp3000_text_feed(struct dsp3000_text *text, uint8_t byte, struct dsp3000_s
         }
         text->length = 0;
         text->overlong = false;
-        text->wrong |= !good && text->lines; /* of the first the beginning may be missing */
+        if (good)
+            sample->gap = text->gap;
+        text->gap = !good && (text->gap || text->lines); /* of the first the beginning may be missing */
+        text->wrong |= !good && text->lines;
         text->lines = true;
         text->ended = true;
         return good;
@@ -105,12 +108,17 @@ bool dsp3000_words_feed(struct dsp3000_words *words, uint8_t byte, struct dsp300
         ++*trust;
     if (!right || !believed(words, phase)) {
         words->held = words->held && !used;
+        words->gap = words->gap || used;
         return false;
     }
     double unit = words->mode == DSP3000_RATE ? 60e-6 : 6e-6;
-    struct dsp3000_sample now = {content(words->window) * unit, valid};
+    struct dsp3000_sample now = {.degrees = content(words->window) * unit, .valid = valid};
     bool given = words->held || !valid;
-    *sample = valid ? words->last : now;
+    if (given) {
+        *sample = valid ? words->last : now;
+        sample->gap = words->gap;
+        words->gap = false;
+    }
     words->last = now;
     words->held = valid;
     return given;

@@ -11,6 +11,7 @@ enum dsp3000_mode { DSP3000_RATE, DSP3000_INCREMENTAL, DSP3000_INTEGRATED };
 struct dsp3000_sample {
     double degrees; /* or degrees per second */
     bool valid;     /* the gyro's own judgement */
+    bool gap;       /* before it one was refused or broken off, which an increment is missing with */
 };
 
 /* A frame of text has 21 bytes: the number "(-)xxx.xxxxxx" at the right of 15, three spaces, 0 or 1, CR LF
@@ -24,6 +25,7 @@ struct dsp3000_text {
     uint8_t length;
     bool overlong; /* or not text: wait for the next line */
     bool lines;    /* there was one */
+    bool gap;      /* since the last sample a line was not a frame; the caller sets it where one was broken off */
     bool wrong;    /* a line was not a frame, since the caller reset this */
     bool ended;    /* one came, likewise */
 };
@@ -44,6 +46,7 @@ struct dsp3000_words {
     uint8_t trust[4]; /* by phase of the word's last byte */
     uint8_t other[4]; /* words of another mode in a row, likewise */
     bool wrong;       /* so many that the gyro is in another mode, since the caller reset this */
+    bool gap;         /* since the last sample one was not right; the caller sets it where one was broken off */
     bool held;        /* `last` waits for the word after it */
     struct dsp3000_sample last;
 };

@@ -82,8 +82,11 @@ static void refuses_other_text(void **state)
 /* --- a stream of text in which one byte is wrong --- */
 
 static const struct dsp3000_sample measured[] = {
-    {0.015733, true},    {-12.5, true}, {12.5, true},   {-0.000123, true}, {374.999999, true},
-    {-374.999999, true}, {100, true},   {-7.25, false}, {0, true},         {-90.010203, true},
+    {.degrees = 0.015733, .valid = true},   {.degrees = -12.5, .valid = true},
+    {.degrees = 12.5, .valid = true},       {.degrees = -0.000123, .valid = true},
+    {.degrees = 374.999999, .valid = true}, {.degrees = -374.999999, .valid = true},
+    {.degrees = 100, .valid = true},        {.degrees = -7.25, .valid = false},
+    {.degrees = 0, .valid = true},          {.degrees = -90.010203, .valid = true},
 };
 enum { MEASURED = sizeof measured / sizeof measured[0], FRAME = 21, STREAM = MEASURED * FRAME };
 
@@ -161,6 +164,29 @@ static void text_comes_back_after_garbage(void **state)
     assert_near(sample.degrees, 4, 0);
 }
 
+static void tells_a_gap_in_text(void **state)
+{
+    (void)state;
+    struct dsp3000_text text = {0};
+    struct dsp3000_sample sample;
+    static const struct {
+        const char *said;
+        bool gap;
+    } lines[] = {
+        {"678 1\r\n       1.000000   1\r\n", false}, /* of the first line nobody knows what it was */
+        {"       1.000000   1\r\n", false},
+        {"       1.00000   1\r\n\xff       1.000000   1\r\n       2.000000   1\r\n", true},
+        {"       1.000000   1\r\n", false},
+    };
+    for (size_t i = 0; i < sizeof lines / sizeof *lines; i++) {
+        bool given = false;
+        for (const char *at = lines[i].said; *at; at++)
+            given |= dsp3000_text_feed(&text, (uint8_t)*at, &sample);
+        assert_true(given);
+        assert_int_equal(sample.gap, lines[i].gap);
+    }
+}
+
 /* --- words --- */
 
 enum { SYNCHRONISATION = 1 };
@@ -231,6 +257,24 @@ static void a_fault_is_told_at_once(void **state)
     assert_true(feed_word(&words, word_of(true, DSP3000_RATE, 6), &sample));
     assert_true(sample.valid);
     assert_near(sample.degrees, 5 * 60e-6, 1e-18);
+}
+
+static void tells_a_gap_in_words(void **state)
+{
+    (void)state;
+    const uint32_t word = word_of(true, DSP3000_INCREMENTAL, 5);
+    struct dsp3000_sample sample;
+    struct dsp3000_words words = trusting(DSP3000_INCREMENTAL);
+    assert_true(accepts(&words, word, &sample));
+    assert_false(sample.gap);
+    feed_word(&words, word ^ 1, &sample);
+    bool given = false;
+    for (int i = 0; i < 2 * DSP3000_TRUSTED && !given; i++)
+        given = feed_word(&words, word, &sample);
+    assert_true(given);
+    assert_true(sample.gap);
+    assert_true(feed_word(&words, word, &sample));
+    assert_false(sample.gap);
 }
 
 static void refuses_each_flipped_bit(void **state)
@@ -499,6 +543,12 @@ static void counts_each_increment_once(void **state)
     assert_true(flag(gyro));
     assert_int_equal(line_step(gyro), FL_OK);
     assert_near(GET(gyro, "increment", double), 0, 0);
+    /* A line that came in pieces: the next step that has any says so, in its sum and its flag. */
+    line_say(&line, "       0.12500");
+    line_say(&line, "\r\n");
+    STEP_UNTIL(gyro, (line_say(&line, "       0.125000   1\r\n"), !flag(gyro)));
+    assert_near(GET(gyro, "increment", double), 0, 0);
+    STEP_UNTIL(gyro, (line_say(&line, "       0.125000   1\r\n"), flag(gyro)));
     /* More than can wait: some are lost, and this step's angle with them. */
     STEP_UNTIL(gyro, (say_lines(&line, "       0.125000   1\r\n", 200), poll(NULL, 0, 20), !flag(gyro)));
     assert_near(GET(gyro, "increment", double), 0, 0);
@@ -618,10 +668,12 @@ int main(void)
         cmocka_unit_test(refuses_other_text),
         cmocka_unit_test(no_single_wrong_byte_gives_a_wrong_value_that_the_format_can_show),
         cmocka_unit_test(text_comes_back_after_garbage),
+        cmocka_unit_test(tells_a_gap_in_text),
         cmocka_unit_test(makes_sure_of_the_mode),
         cmocka_unit_test(says_what_is_wrong),
         cmocka_unit_test(reads_words),
         cmocka_unit_test(a_fault_is_told_at_once),
+        cmocka_unit_test(tells_a_gap_in_words),
         cmocka_unit_test(refuses_each_flipped_bit),
         cmocka_unit_test(refuses_another_mode_and_the_impossible),
         cmocka_unit_test(bytes_lost_between_two_words_seldom_make_one),
