@@ -12,7 +12,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import apps, dds_security, interfaces, keys, message_keys, operators, privileges, transport
 from flotilla.fleet.apps import BuiltApp
-from flotilla.fleet.model import Fleet, Host, Robot
+from flotilla.fleet.model import Board, Fleet, Host, Robot
 
 if TYPE_CHECKING:
     import jinja2
@@ -140,11 +140,25 @@ def _control_tasks(fleet: Fleet, robot: Robot) -> dict[str, tuple[bytes, object]
     parsed = {name: _parsed(task) for name, task in tasks.items()}
     problems = []
     for name, description in parsed.items():
-        found = [*interfaces.problems(description, fleet, robot), *transport.problems(fleet, name, description)]
+        found = [
+            *_problems_of_processor(description, fleet.boards[robot.board]),
+            *interfaces.problems(description, fleet, robot),
+            *transport.problems(fleet, name, description),
+        ]
         problems += [f"{paths.shown(paths.TASKS / f'{name}.yml')}: {problem}" for problem in found]
     if problems:
         raise UserError("\n".join(problems))
     return {name: (task, parsed[name]) for name, task in tasks.items()}
+
+
+def _problems_of_processor(task: object, board: Board) -> list[str]:
+    cpu = task.get("cpu") if isinstance(task, dict) else None
+    if not isinstance(cpu, int) or cpu < board.processors:  # what is no number is the runtime's to say
+        return []
+    return [
+        f"cpu: {cpu}: board {board.name} has processors 0 to {board.processors - 1}; choose one of them, or correct "
+        f"`processors:` in group_vars/board_{board.name}.yml"
+    ]
 
 
 def _task(name: str, values: dict[str, object]) -> bytes:

@@ -585,6 +585,11 @@ def _boards(raw: dict[str, Any]) -> Iterator[Finding]:
             loc = ("boards", name, "kernel_arguments")
             yield loc, f"the kernel makes only ttyS0 to ttyS{uarts - 1}", f"add 8250.nr_uarts={max(16, needed)}"
 
+        count = board.get("processors", 1)
+        for at, processor in enumerate(board.get("isolated_processors", ())):
+            if isinstance(count, int) and isinstance(processor, int) and processor >= count:
+                loc = ("boards", name, "isolated_processors", at)
+                yield loc, f"the board has processors 0 to {count - 1}", "write `processors:`, or remove it"
         if board.get("architecture") == "i386":
             if board.get("suite") == "trixie":
                 yield ("boards", name, "suite"), "Debian 13 has no kernel for i386", "bookworm"

@@ -303,6 +303,12 @@ class Board(_Model):
     processor: Processor | None = None
     """Processor for which programs that measure the board are compiled: a value of GCC's `-march`. Leave it out for
     the oldest one of the architecture."""
+    processors: Annotated[Integer, between(1, 1024)] = 1
+    """How many processors the computer has, hyper-threads counted as the kernel does. The highest `cpu:` of a control
+    task is one less."""
+    isolated_processors: list[Annotated[Integer, between(1, 1023)]] = []
+    """Processors for control tasks alone, those that name one by `cpu:`: nothing else is put there, interrupts neither.
+    The first processor, 0, is for all the rest."""
     kernel: Literal["debian", "lean"]
     """`debian`: Debian's real-time kernel. `lean`: the one that `make kernel` builds from `kernel/NAME.yml`."""
     kernel_arguments: list[Word]

@@ -151,7 +151,16 @@ def kernel_arguments(board: Board) -> list[str]:
     console = f"console={board.console.tty},{board.console.baud}n8"
     stop = board.watchdog and board.watchdog.stop
     own = [f"flotilla.watchdog_stop={stop.port}:{stop.value:o}"] if stop else []  # for preinit
-    return [*COMMON_ARGUMENTS, *board.kernel_arguments, *own, "console=tty0", console]
+    return [*COMMON_ARGUMENTS, *_isolation(board), *board.kernel_arguments, *own, "console=tty0", console]
+
+
+def _isolation(board: Board) -> list[str]:
+    """What keeps all but control tasks from the isolated processors: services, interrupts, the kernel's callbacks."""
+    isolated = ",".join(map(str, board.isolated_processors))
+    if not isolated:
+        return []
+    others = ",".join(str(each) for each in range(board.processors) if each not in board.isolated_processors)
+    return [f"isolcpus=managed_irq,domain,{isolated}", f"irqaffinity={others}", f"rcu_nocbs={isolated}"]
 
 
 def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:

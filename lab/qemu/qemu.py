@@ -115,6 +115,7 @@ def command_line(board: Board, card: Path, options: Options) -> list[str]:
     """The whole command, ready to run. `card`: overlay of the card image, see `make_overlay`."""
     argv = [program(board), "-name", options.name, "-nodefaults", "-no-user-config", "-display", "none"]
     argv += ["-machine", board.qemu.machine, "-cpu", board.qemu.cpu, "-m", str(board.qemu.memory_mib)]
+    argv += ["-smp", str(board.processors)]
     if board.firmware == "uefi":
         argv += ["-bios", uefi_firmware()]
     if options.virtual_time:

@@ -439,6 +439,19 @@ static void serve_parameters(const struct executive *executive)
                 strerror(error));
 }
 
+/* Move to the task's processor, before anything is started that has to run there. */
+static bool take_processor(const struct task *task, struct run_result *result)
+{
+    char text[128];
+    int error = task->cpu == TASK_ANY_CPU ? 0 : privilege_processor(task->cpu);
+    if (!error)
+        return true;
+    snprintf(text, sizeof text, "cpu: %d: the task cannot run there (%s); this computer has processors 0 to %ld",
+             task->cpu, strerror(error), sysconf(_SC_NPROCESSORS_CONF) - 1);
+    end(result, ENDING_FAILED, NULL, text);
+    return false;
+}
+
 /* Start the control thread and its guard; 0 or an errno. Signals that end the task are blocked in both. */
 static int start_threads(struct executive *executive, int priority, pthread_t *guarding)
 {
@@ -482,7 +495,7 @@ static void *run(void *argument)
         service->overran = rate_overran;
         service->overran_context = executive;
     }
-    if (start_blocks(task, result)) {
+    if ((options->no_wait || take_processor(task, result)) && start_blocks(task, result)) {
         executive->status = status_create(task);
         int error = start_threads(executive, priority, &guarding);
         if (error) {

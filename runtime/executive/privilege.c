@@ -43,6 +43,16 @@ int privilege_priority(int priority, const char *consequence)
     return priority;
 }
 
+int privilege_processor(int cpu)
+{
+    cpu_set_t wanted;
+    if (cpu >= CPU_SETSIZE)
+        return EINVAL;
+    CPU_ZERO(&wanted);
+    CPU_SET((size_t)cpu, &wanted);
+    return sched_setaffinity(0, sizeof wanted, &wanted) < 0 ? errno : 0;
+}
+
 void privilege_touch_stack(void)
 {
     volatile unsigned char stack[TOUCHED_BYTES];

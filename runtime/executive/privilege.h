@@ -10,6 +10,9 @@ void privilege_lock_memory(void);
 /* Returns `priority` where SCHED_FIFO is allowed, otherwise 0 after reporting the consequence. */
 int privilege_priority(int priority, const char *consequence);
 
+/* Let the calling thread, and all that it starts, run on one processor alone; 0 or an errno. */
+int privilege_processor(int cpu);
+
 /* Touch the stack of the calling thread, as deep as a step may use it. */
 void privilege_touch_stack(void);
 

@@ -441,6 +441,7 @@ void task_build(struct task *task, struct registry *registry, struct problems *p
     task->overruns = file.overruns;
     task->overrun = file.overrun;
     task->priority = (int)file.priority;
+    task->cpu = (int)file.cpu;
     task->blocks = grown(NULL, sizeof *task->blocks * (file.count + 1));
     for (size_t i = 0; i < file.count; i++)
         make_block(&building, registry, &file.blocks[i]);

@@ -23,6 +23,7 @@ struct task {
     char *name; /* the file's, without directory and suffix */
     int64_t period_ns, phase_ns, overruns;
     int priority;
+    int cpu; /* TASK_ANY_CPU, or the processor of all threads */
     enum overrun overrun;
     struct fl_block *trigger;  /* a step is due when this block has new input */
     struct task_block *blocks; /* in the order of execution */

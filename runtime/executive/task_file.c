@@ -327,6 +327,13 @@ static const struct key task_keys[] = {
      .default_value = "0",
      .then = check_priority,
      .meaning = "of the control thread by SCHED_FIFO, from 2; 0: ordinary scheduling. 1 is left to driver threads"},
+    {.name = "cpu",
+     .value = INTEGER,
+     .offset = offsetof(struct task_file, cpu),
+     .min = "0",
+     .max = "1023",
+     .otherwise = "any that is not isolated",
+     .meaning = "the processor that all threads of the task run on, its drivers' too; 0 is the first"},
     {.name = "overrun",
      .value = CHOICE,
      .offset = offsetof(struct task_file, overrun),
@@ -367,7 +374,7 @@ void task_file_read(struct task_file *task, struct problems *problems)
 {
     yaml_parser_t parser;
     struct reading reading = {.task = task, .problems = problems};
-    *task = (struct task_file){.phase_ns = UNWRITTEN};
+    *task = (struct task_file){.phase_ns = UNWRITTEN, .cpu = TASK_ANY_CPU};
     FILE *file = fopen(problems->file, "re");
     if (!file) {
         problem(problems, 0, "%s", strerror(errno));

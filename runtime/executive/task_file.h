@@ -4,6 +4,7 @@
  *     phase: 500 us            # steps are due this long after each multiple of the period; see task_file.c
  *     trigger: gyro            # a step is due when this block has new input; period is then the expected interval
  *     priority: 80             # SCHED_FIFO, 2 to 98; 0: ordinary scheduling
+ *     cpu: 1                   # the processor that all threads of the task run on
  *     overrun: skip            # after a step that ends when the next one was already due: skip, catch-up, stop-safe
  *     overruns: 10             # so many overruns in a row lead to the safe state; 0: never
  *     blocks:
@@ -24,6 +25,8 @@
 #include <stdio.h>
 #include <yaml.h>
 
+#define TASK_ANY_CPU (-1)
+
 enum overrun { OVERRUN_SKIP, OVERRUN_CATCH_UP, OVERRUN_STOP_SAFE }; /* the order of the key's choices */
 
 struct block_entry {
@@ -35,7 +38,7 @@ struct block_entry {
 };
 
 struct task_file {
-    int64_t period_ns, phase_ns, priority, overruns;
+    int64_t period_ns, phase_ns, priority, overruns, cpu; /* `cpu`: TASK_ANY_CPU without the key */
     enum overrun overrun;
     const char *trigger; /* NULL: the clock */
     unsigned trigger_line;

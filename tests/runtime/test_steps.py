@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import subprocess
 import time
 from pathlib import Path
@@ -119,6 +120,32 @@ def test_steps_allocate_nothing(tasks: Tasks, tmp_path: Path) -> None:
     bad = tasks.run(task("a: {type: misbehave, parameters: {manner: allocate}}"), environment=environment)
     assert bad.status == 99
     assert "allocation in a control step" in bad.err
+
+
+def test_all_threads_keep_to_the_tasks_processor(tasks: Tasks) -> None:
+    """Seen to fail where the processor is taken after the threads have been started."""
+    cpu = max(os.sched_getaffinity(0))
+    text = task("a: {type: gain, in: {in: 1}}", f"period: 10 ms\ncpu: {cpu}")
+    with subprocess.Popen(tasks.argv(text, "--control", str(tasks.directory / "control")), text=True) as running:
+        try:
+            threads: dict[str, str] = {}
+            until = time.monotonic() + 60
+            while "guard" not in threads and time.monotonic() < until:
+                threads = {
+                    (each / "comm").read_text().strip(): (each / "status").read_text()
+                    for each in Path(f"/proc/{running.pid}/task").iterdir()
+                }
+            assert {"task", "guard"} <= threads.keys()
+            for name in ("task", "guard"):
+                assert f"Cpus_allowed_list:\t{cpu}\n" in threads[name], f"{name}: {threads[name]}"
+        finally:
+            running.terminate()
+
+
+def test_a_processor_that_is_not_there_ends_the_task(tasks: Tasks) -> None:
+    ended = tasks.run(task("a: {type: gain, in: {in: 1}}", "period: 10 ms\ncpu: 1023"))
+    assert ended.status != 0
+    assert "cpu: 1023: the task cannot run there (Invalid argument); this computer has processors 0 to " in ended.err
 
 
 def test_privileges_that_are_missing_are_named(tasks: Tasks) -> None:

@@ -51,6 +51,7 @@ REFUSED = {
         task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 1"),
         "priority: 1 leaves no priority for driver threads",
     ),
+    "processor": (task("a: {type: gain, in: {in: 1}}", "period: 1 ms\ncpu: -1"), "2: cpu: -1 is not a whole number"),
     "policy": (
         task("a: {type: gain, in: {in: 1}}", "period: 1 ms\noverrun: ignore"),
         "2: overrun: ignore is not one of",

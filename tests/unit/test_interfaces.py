@@ -47,6 +47,16 @@ def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can: dict[str, Can]
     return ""
 
 
+def test_a_task_for_a_processor_that_the_board_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    block = "    type: clock\n{}"
+    assert refused(tmp_path, monkeypatch, {}, block.format("cpu: 0\n")) == ""
+    said = refused(tmp_path, monkeypatch, {}, block.format("cpu: 1\n"))
+    assert said.endswith(
+        "drive.yml: cpu: 1: board smartcoret3 has processors 0 to 0; choose one of them, or correct `processors:` in "
+        "group_vars/board_smartcoret3.yml"
+    )
+
+
 def test_each_interface_has_a_file_of_its_own() -> None:
     fleet = robot_with({"can0": Can(bitrate=1_000_000, restart_ms=20), "can1": Can(bitrate=125_000)})
     files = identity.render(fleet, fleet.robots[3])

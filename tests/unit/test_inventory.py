@@ -398,12 +398,28 @@ CASES = {
     "firmware without a boot loader": Case(
         PC104, "architecture: i386", "architecture: i386\n  firmware: uefi", "board.firmware", "is for amd64…bios"
     ),
+    "isolated processor": Case(
+        X86_64,
+        "isolated_processors: [1]",
+        "isolated_processors: [2]",
+        "board.isolated_processors.0",
+        "processors 0 to 1…`processors:`",
+        "[2]",
+    ),
+    "first processor isolated": Case(
+        X86_64,
+        "isolated_processors: [1]",
+        "isolated_processors: [0]",
+        "board.isolated_processors.0",
+        "1 to 1023",
+        "[0]",
+    ),
     "firmware": Case(X86_64, "firmware: uefi", "firmware: efi", "board.firmware", "'bios' or 'uefi'"),
     "qemu system": Case(X86_64, "system: x86_64", "system: i386", "board.qemu.system", "cannot run amd64…x86_64"),
     "qemu memory": Case(X86_64, "memory_mib: 512", "memory_mib: 32", "board.qemu.memory_mib", "64 to 65536"),
     "qemu key": Case(X86_64, "    disk: ahci", "    disk: ahci\n    disks: 2", "board.qemu.disks", "mean disk?"),
     "value twice": Case(
-        X86_64, "  kernel: debian", "  kernel: debian\n  kernel: lean", "board.kernel", "stands twice, first in line 10"
+        X86_64, "  kernel: debian", "  kernel: debian\n  kernel: lean", "board.kernel", "stands twice, first in line 12"
     ),
     "shared value in the wrong file": Case(
         X86_64, "board:\n", "network: {}\nboard:\n", "network", "a part of those who share it…group_vars/all.yml"

@@ -169,6 +169,9 @@ def test_its_card_boots_it(board: Board) -> None:
         "console=ttyS2,38400n8",
     ]  # fmt: skip
     assert card.kernel_arguments(board) == arguments
+    two = board.model_copy(update={"processors": 4, "isolated_processors": [1, 3]})
+    isolation = ["isolcpus=managed_irq,domain,1,3", "irqaffinity=0,2", "rcu_nocbs=1,3"]
+    assert [each for each in card.kernel_arguments(two) if each not in arguments] == isolation
     partitions = [card.STATE, *card.SLOTS, card.DATA]
     assert [one.end for one in partitions] == [*(one.start for one in partitions[1:]), card.SIZE]
     assert [one.partuuid(board) for one in partitions] == [f"464c4f54-0{number}" for number in (1, 2, 3, 4)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import re
 import time
 
 from flotilla.fleet import identity
@@ -45,6 +46,33 @@ def test_interrupt_threads_have_their_priorities(robot: RobotGuest, board: Board
         expected.add("tty-flip")
     for part in expected:
         assert any(part in name for name in checked), f"no thread of *{part}* among {sorted(checked)}"
+
+
+def test_isolated_processors_are_left_to_control_tasks(robot: RobotGuest, board: Board) -> None:
+    """Seen to fail without `isolcpus=` and, for interrupts, without `irqaffinity=`."""
+    isolated = ",".join(map(str, board.isolated_processors))
+    assert sh(robot, "nproc --all") == str(board.processors)
+    assert sh(robot, "cat /sys/devices/system/cpu/isolated") == isolated
+    if not isolated:
+        return
+    others = ",".join(str(each) for each in range(board.processors) if each not in board.isolated_processors)
+    said = sh(robot, "cat /proc/[0-9]*/status 2>/dev/null; true")
+    # Kernel threads have no memory of their own; some belong to a processor.
+    programs = [one for one in said.split("Name:\t") if "VmRSS" in one]
+    where = {one.split("\n")[0]: found[1] for one in programs if (found := re.search(r"Cpus_allowed_list:\t(.*)", one))}
+    assert {"systemd", "sshd"} <= where.keys()
+    assert {name: each for name, each in where.items() if each != others} == {}
+    interrupts = sh(robot, "cat /proc/irq/*/effective_affinity_list").split()
+    assert set(interrupts) == {others}
+    task = "period: 10 ms\npriority: 80\ncpu: {}\nblocks:\n  a: {{type: gain, in: {{in: 1}}}}\n"
+    script = (
+        "cat >/run/one.yml; flotilla-run /run/one.yml & pid=$!; "
+        'timeout 60 sh -c "until grep -q guard /proc/$pid/task/*/comm; do :; done"; '
+        "cat /proc/$pid/task/*/status; kill $pid; wait $pid"
+    )
+    for processor in range(board.processors):
+        done = robot.shell.run(["sudo", "sh", "-c", script], stdin=task.format(processor), check=False)
+        assert set(re.findall(r"Cpus_allowed_list:\t(.*)", done.stdout)) == {str(processor)}, done
 
 
 def test_processor_stays_awake(robot: RobotGuest) -> None:
