@@ -37,6 +37,7 @@ HARMLESS = {
     r"L1TF: Kernel not compiled for PAE": "of later processors than such boards have",
     r"fail to add MMCONFIG information": "QEMU's i440FX has no extended PCI configuration",
     r"ata\d.*: LPM support broken, forcing max_power": "QEMU's disk saves no power",
+    r"mtrr: your CPUs had inconsistent": "UEFI in QEMU sets those of the first processor only",
     r"GPT: ?(Primary|\d|Alternate|Use GNU)": "a new card, which is larger than its image: flotilla-grow corrects it",
     r"Firmware left e100 interrupts enabled; disabling": "QEMU's BIOS leaves the wired port so",
 }
