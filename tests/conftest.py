@@ -70,7 +70,7 @@ class RobotGuest:
 GuestFactory = Callable[..., RobotGuest]
 """`guest(number)`: the robot's guest, booted, with SSH connected; `kernel=` for another than its board's.
 
-`fresh_guest` also takes the arguments of `Guest` (`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of
+`fresh_guest` also takes `disk=` for another bus of the card, and the arguments of `Guest` (`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of
 `qemu.Options`), `segment=segment` to put it on a network with others, `boot=False` to power it on oneself, and `image=`
 with a `label=` for another card."""
 
@@ -157,6 +157,7 @@ def _boot(
     cleanup: ExitStack,
     *,
     kernel: str | None = None,
+    disk: str | None = None,
     boot: bool = True,
     segment: Segment | None = None,
     qemu_options: dict[str, Any] | None = None,
@@ -168,6 +169,8 @@ def _boot(
     board = fleet.boards[robot.board]
     if kernel and kernel != board.kernel:
         board, image = _with_kernel(fleet, robot, kernel)
+    if disk:
+        board = board.model_copy(update={"qemu": board.qemu.model_copy(update={"disk": disk})})
     image = image or image_of(robot)
     if not image.exists():
         pytest.fail(f"{paths.shown(image)} is missing; build it: make image ROBOT={number}", pytrace=False)

@@ -240,7 +240,7 @@ class Qemu(_Model):
     """Argument of `-cpu`."""
     memory_mib: Annotated[Integer, between(64, 65536, unit="MiB")]
     """RAM of the machine."""
-    disk: Literal["ide", "ahci", "virtio"]
+    disk: Literal["ide", "ahci", "nvme", "usb", "virtio"]
     """Bus that the card is attached to."""
     network: Word
     """QEMU device model of the wired port."""

@@ -84,8 +84,12 @@ class Subject:
         return self.made.root / "root.squashfs"
 
     def arguments(self, without: tuple[str, ...] = ()) -> tuple[str, ...]:
-        """The shipped kernel command line `without` some of its words, and what a run from memory needs."""
-        return (*(word for word in card.kernel_arguments(self.board) if word not in without), *_ARGUMENTS)
+        """The shipped kernel command line `without` some of its words, and what a run from memory needs.
+
+        The measured machine has one processor, whatever the board has.
+        """
+        single = self.board.model_copy(update={"isolated_processors": []})
+        return (*(word for word in card.kernel_arguments(single) if word not in without), *_ARGUMENTS)
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of the parts whose bytes decide the results."""

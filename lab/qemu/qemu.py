@@ -26,6 +26,16 @@ CARD_BYTES = 1_000_000_000
 UEFI_PLACES = (Path("/usr/share/ovmf/OVMF.fd"), Path("/usr/share/qemu/OVMF.fd"))
 """Where distributions have the firmware that needs no file for its settings."""
 
+_DISKS = {
+    # `ide.0` is what the machine has built in: IDE on pc, AHCI on q35.
+    "ide": ["ide-hd,drive=card,bus=ide.0,unit=0,bootindex=0"],
+    "ahci": ["ahci,id=sata", "ide-hd,drive=card,bus=sata.0,bootindex=0"],
+    "nvme": ["nvme,drive=card,serial=card,bootindex=0"],
+    "usb": ["qemu-xhci", "usb-storage,drive=card,bootindex=0"],
+    "virtio": ["virtio-blk-pci,drive=card,bootindex=0"],
+}
+"""Devices that attach the card, by `qemu.disk`."""
+
 _VIRTUAL_START = datetime(2026, 1, 1)
 
 # Chardev backends: the text after `-chardev` without the id.
@@ -275,14 +285,11 @@ def _card(board: Board, overlay: Path, options: Options) -> list[str]:
         options.log_writes.touch()
         blockdev = logged(blockdev, options.log_writes)
     blockdev["node-name"] = "card"
-    if board.qemu.disk == "virtio":
-        devices = ["virtio-blk-pci,drive=card,bootindex=0"]
-    elif board.qemu.disk == "ahci" and "q35" not in board.qemu.machine:
-        devices = ["ahci,id=sata", "ide-hd,drive=card,bus=sata.0,bootindex=0"]
-    else:  # `ide.0` is what the machine has built in: IDE on pc, AHCI on q35
-        devices = ["ide-hd,drive=card,bus=ide.0,unit=0,bootindex=0"]
+    disk = board.qemu.disk
+    if disk == "ahci" and "q35" in board.qemu.machine:
+        disk = "ide"
     argv = ["-blockdev", json.dumps(blockdev)]
-    for device in devices:
+    for device in _DISKS[disk]:
         argv += ["-device", device]
     return argv
 

@@ -108,6 +108,8 @@ def test_a_board_with_uefi_has_its_firmware(tmp_path: Path, monkeypatch: pytest.
         ("ahci", "pc-q35-7.2", ["ide-hd,drive=card,bus=ide.0,unit=0,bootindex=0"]),
         ("ahci", "pc-i440fx-7.2", ["ahci,id=sata", "ide-hd,drive=card,bus=sata.0,bootindex=0"]),
         ("virtio", "pc-i440fx-7.2", ["virtio-blk-pci,drive=card,bootindex=0"]),
+        ("nvme", "pc-q35-7.2", ["nvme,drive=card,serial=card,bootindex=0"]),
+        ("usb", "pc-q35-7.2", ["qemu-xhci", "usb-storage,drive=card,bootindex=0"]),
     ],
 )
 def test_card(disk: str, machine: str, devices: list[str]) -> None:
