@@ -70,9 +70,9 @@ class RobotGuest:
 GuestFactory = Callable[..., RobotGuest]
 """`guest(number)`: the robot's guest, booted, with SSH connected; `kernel=` for another than its board's.
 
-`fresh_guest` also takes `disk=` for another bus of the card, and the arguments of `Guest` (`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of
-`qemu.Options`), `segment=segment` to put it on a network with others, `boot=False` to power it on oneself, and `image=`
-with a `label=` for another card."""
+`fresh_guest` also takes `disk=` for another bus of the card, the arguments of `Guest` (`card_bytes=`, `capture=True`),
+`qemu_options=` (a dict of fields of `qemu.Options`), `segment=segment` to put it on a network with others, `boot=False`
+to power it on oneself, and `image=` with a `label=` for another card."""
 
 
 @pytest.fixture(scope="session")
