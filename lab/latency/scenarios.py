@@ -21,6 +21,21 @@ while True:
     port.sendto(bytes(1400), port.getsockname())
     port.recv(2000)
 """
+_TCP = """
+import os, socket
+listener = socket.create_server(("127.0.0.1", 0), backlog=16)
+for _ in range(10):
+    sender = socket.create_connection(listener.getsockname())
+    receiver = listener.accept()[0]
+    if not os.fork():
+        while True:
+            sender.sendall(bytes(100))
+    if not os.fork():
+        while True:
+            receiver.recv(100)
+os.wait()
+"""
+"""hackbench does this with `-i`, but that of Debian 13 (rt-tests 2.8) cannot connect."""
 CPU: tuple[Command, ...] = (("sh", "-c", "while :; do :; done"),) * 4
 MEMORY: tuple[Command, ...] = (("python3", "-c", "while True: b'x' * (8 << 20)"),) * 2
 """Page faults: 8 MiB are mapped, filled and given back."""
@@ -29,7 +44,7 @@ TIMERS: tuple[Command, ...] = (("cyclictest", "-q", "-t", "10", "-p", "60", "-i"
 5 % that the kernel keeps for them, by holding up every real-time thread for 50 ms."""
 SCHEDULER: tuple[Command, ...] = (("hackbench", "-g", "4", "-l", "100000000"),)
 """160 processes that send each other messages."""
-NETWORK: tuple[Command, ...] = (("python3", "-c", _UDP),) * 2 + (("hackbench", "-i", "-g", "1", "-l", "100000000"),)
+NETWORK: tuple[Command, ...] = (("python3", "-c", _UDP),) * 2 + (("python3", "-c", _TCP),)
 """UDP and TCP over the loopback interface."""
 FILES: tuple[Command, ...] = (
     ("sh", "-c", "while :; do echo 3 >/proc/sys/vm/drop_caches; cat /usr/bin/* >/dev/null; done"),

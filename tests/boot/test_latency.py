@@ -44,6 +44,13 @@ def test_latency_is_the_accepted_one(measured: Callable[[str], Results], boards:
     assert accepted.startswith("every figure is that of")
 
 
+def test_latency_of_a_pc_with_debian_13_is_the_accepted_one(fleet: Fleet, session_artefacts: Path) -> None:
+    """Debian's kernel of the other board and the other release. Seen to fail before it was accepted."""
+    board = next(board for board in fleet.boards.values() if board.suite == "trixie")
+    found = run.measure(board, "quick", session_artefacts / "latency" / board.name)
+    assert gate.check(found, gate.baseline(board, "quick")).startswith("every figure is that of")
+
+
 def test_a_run_repeats_to_the_byte_however_the_host_schedules(
     measured: Callable[[str], Results], boards: dict[str, Board], artefacts: Path
 ) -> None:
