@@ -304,6 +304,11 @@ def _configure(stage: Stage, console: str) -> None:
     stage.in_target("systemctl", "set-default", "multi-user.target")
     stage.in_target("systemctl", "enable", f"serial-getty@{console}.service")
     (stage.target / "data").mkdir()
+    # Debian 13 makes these links at each boot, to files that it wants moved there; the robot would differ from its image.
+    links = ["etc/default/locale", "etc/vconsole.conf"]
+    if any(f" /{links[0]} " in file.read_text() for file in (stage.target / "usr/lib/tmpfiles.d").glob("debian.conf")):
+        (stage.target / links[0]).rename(stage.target / "etc/locale.conf")
+        stage.in_target("systemd-tmpfiles", "--create", *(f"--prefix=/{link}" for link in links))
 
 
 def _clean(stage: Stage) -> dict[str, object]:

@@ -301,7 +301,7 @@ def test_a_missing_key_is_named(own: Path, merged: dict[str, Any], place: tuple[
         ("disk_modules", ["ahci.ko"], "ahci.ko: is not a kernel module's name; such as ata_piix"),
         ("watchdog.stop.value", 256, "256: is out of range; 0 to 255"),
         ("qemu.system", "arm", "arm: is not known; one of 'i386' or 'x86_64'"),
-        ("qemu.disk", "scsi", "scsi: is not known; one of 'ide', 'ahci' or 'virtio'"),
+        ("qemu.disk", "scsi", "scsi: is not known; one of 'ide', 'ahci', 'nvme', 'usb' or 'virtio'"),
         ("qemu.memory_mib", 16, "16: is out of range; 64 to 65536"),
     ],
 )
