@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from flotilla.common import cache, namespace, paths, progress
+from flotilla.common import cache, namespace, paths, progress, together
 from flotilla.fleet.model import Board
 from images.builder import debian_kernel, initramfs, kernel, pool, runtime, tools
 from images.builder.chroot import Chroot, mount
@@ -35,6 +35,8 @@ _SECONDS = {_BOOTSTRAP: 80, "kernel": 10, "runtime": 1, "overlay": 1, "clean": 0
 """The stage's parts, in their order, and about how long each takes on two cores: how far a build is."""
 _PACKAGE = re.compile(r"^I: (?:Unpacking|Configuring) [^ ]+\.\.\.$", re.MULTILINE)
 """What debootstrap says of a package, twice of each."""
+_RUNTIME = "runtime"
+"""A pipe in the stage's repository. It says the name of the runtime's package there, as soon as that is compiled."""
 _STAGE_FILES = ("rootfs.py", "chroot.py", "debian_kernel.py", "initramfs.py", "init")
 
 
@@ -46,13 +48,12 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     own = kernel.board_kernel(board) if board.kernel == "lean" else None
     if own:
         lock = lock.without("kernel")
-    drivers = runtime.build(lock.architecture)
     sources = [Path(__file__).parent / name for name in _STAGE_FILES]
     key = cache.digest(
         lock.digest,
         tools_lock.digest,
         own.directory.name if own else "",
-        drivers.directory.name,
+        runtime.name(lock.architecture),
         debian_kernel.PACKER,
         board.model_dump_json(include={"disk_modules", "architecture", "console"}),
         _DATA,
@@ -61,6 +62,19 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     )
 
     def make(out: Path) -> None:
+        """The runtime is compiled meanwhile: the stage needs it late, and leaves a processor idle until then."""
+        (out / "repository").mkdir()
+        os.mkfifo(out / "repository" / _RUNTIME)
+        with (out / "repository" / _RUNTIME).open("r+b", buffering=0) as name:  # both ways, so that nobody waits here
+
+            def compile_runtime() -> None:
+                package = runtime.build(lock.architecture).package
+                shutil.copy(package, out / "repository")
+                name.write(f"{package.name}\n".encode())
+
+            together.run(compile_runtime, lambda: make_root(out))
+
+    def make_root(out: Path) -> None:
         toolset = tools.tree(tools_lock)
         log = paths.BUILD / f"rootfs-{board.name}.log"
         log.unlink(missing_ok=True)  # an earlier build's
@@ -73,14 +87,12 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             if own:
                 shutil.copy(own.package, repository)
                 kernels = [own.package.name]
-            shutil.copy(drivers.package, repository)
             stage = {
                 "architecture": lock.architecture,
                 "release": lock.release,
                 "epoch": lock.epoch,
                 "packages": [package.name for package in packages],
                 "kernels": kernels,
-                "runtime": drivers.package.name,
                 "disk_modules": None if own else board.disk_modules,
                 "console": board.console.tty,
                 "tools": str(toolset),
@@ -163,7 +175,9 @@ def main(description_file: str) -> None:
     with _timed("kernel"):
         version = _kernel(stage, description["kernels"])
     with _timed("runtime"):
-        shutil.copy(stage.tools / "repository" / description["runtime"], stage.target / "tmp/runtime.deb")
+        with (stage.tools / "repository" / _RUNTIME).open() as name:
+            package = name.readline().rstrip()  # once it is compiled
+        shutil.copy(stage.tools / "repository" / package, stage.target / "tmp/runtime.deb")
         stage.in_target("dpkg", "--install", "/tmp/runtime.deb")
         (stage.target / "tmp/runtime.deb").unlink()
     with _timed("overlay"):

@@ -14,7 +14,7 @@ from pathlib import Path
 from flotilla.common import cache, namespace, paths, progress
 from flotilla.common.errors import UserError
 from images.builder import pool, runtime_stage, toolchain, tools
-from images.builder.lock import read_lock
+from images.builder.lock import Lock, read_lock
 
 SOURCE = paths.PROJECT / "runtime"
 LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libnettle8", "libsystemd0", "libyaml-0-2")
@@ -26,6 +26,8 @@ _LOADERS = {
     "i386": ("lib/ld-linux.so.2", "usr/lib/i386-linux-gnu"),
 }
 """The dynamic loader and the libraries in a tree of an architecture. A 64-bit PC runs programs for both."""
+_KIND = "runtime"
+"""Of results in the cache."""
 _LEFT_OUT = ("bench", "tests", "tidy.py")
 """Folders of the source that no package comes from."""
 
@@ -164,7 +166,17 @@ def build(architecture: str) -> Runtime:
             arguments = [str(tree), str(out), architecture, str(lock.epoch), json.dumps(LIBRARIES)]
             namespace.run_stage(runtime_stage.__name__, arguments, log)
 
-    return Runtime(cache.result("runtime", key(architecture), make))
+    return Runtime(cache.result(_KIND, key(architecture), make))
+
+
+def name(architecture: str) -> str:
+    """Of the directory of what `build` makes; it need not be made yet."""
+    return cache.name(_KIND, key(architecture))
+
+
+def wanted(architecture: str) -> list[Lock]:
+    """What `build` would have to find in the pool, which it fills otherwise."""
+    return [] if cache.has(_KIND, key(architecture)) else [read_lock(f"runtime-{architecture}")]
 
 
 def far(log: str) -> progress.Far:
