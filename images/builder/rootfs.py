@@ -220,6 +220,9 @@ def _bootstrap(stage: Stage, architecture: str, release: str, packages: list[str
     config = ["force-unsafe-io", *(f"path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rules)]
     (stage.target / "etc/dpkg/dpkg.cfg.d").mkdir(parents=True, exist_ok=True)
     (stage.target / "etc/dpkg/dpkg.cfg.d/flotilla").write_text("\n".join(config) + "\n")
+    (stage.target / "etc/ssh").mkdir()
+    for kind in ("rsa", "ecdsa", "ed25519"):  # so that the server's package draws none, which takes seconds
+        (stage.target / f"etc/ssh/ssh_host_{kind}_key").touch()  # leftovers.list has them
     stage.shown_in_target("/debootstrap/debootstrap", "--second-stage")
 
 
