@@ -16,7 +16,7 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from flotilla.common import cache, namespace, paths, progress, together
@@ -31,7 +31,7 @@ COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
 _SIZE_LIMIT = "3g"
 _BOOTSTRAP = "debootstrap"
-_SECONDS = {_BOOTSTRAP: 80, "kernel": 10, "runtime": 1, "overlay": 1, "clean": 0, "initramfs": 6, "squashfs": 50}
+_SECONDS = {_BOOTSTRAP: 80, "kernel": 10, "runtime": 1, "overlay": 1, "clean": 0, "initramfs": 1, "squashfs": 55}
 """The stage's parts, in their order, and about how long each takes on two cores: how far a build is."""
 _PACKAGE = re.compile(r"^I: (?:Unpacking|Configuring) [^ ]+\.\.\.$", re.MULTILINE)
 """What debootstrap says of a package, twice of each."""
@@ -75,14 +75,13 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             together.run(compile_runtime, lambda: make_root(out))
 
     def make_root(out: Path) -> None:
-        toolset = tools.tree(tools_lock)
         log = paths.BUILD / f"rootfs-{board.name}.log"
         log.unlink(missing_ok=True)  # an earlier build's
         packages = lock.having("required", "userland")
         title = f"root file system of {board.name} ({len(lock.packages)} packages)"
         with progress.step(title, lambda: far(progress.text(log), len(packages))):
             repository = out / "repository"
-            pool.repository(lock, repository)
+            together.run(lambda: tools.tree(tools_lock), lambda: pool.repository(lock, repository))
             kernels = [package.path for package in lock.having("kernel")]
             if own:
                 shutil.copy(own.package, repository)
@@ -95,7 +94,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
                 "kernels": kernels,
                 "disk_modules": None if own else board.disk_modules,
                 "console": board.console.tty,
-                "tools": str(toolset),
+                "tools": str(tools.tree(tools_lock)),
                 "repository": str(repository),
                 "out": str(out),
             }
@@ -187,11 +186,13 @@ def main(description_file: str) -> None:
     with _timed("clean"):
         contents = _clean(stage)
     out = Path(description["out"])
+    packing: list[Callable[[], object]] = []
     if description["disk_modules"] is not None:
         with _timed("initramfs"):
             image = initramfs.build(stage.tools, stage.target, version, description["disk_modules"])
             (stage.tools / "tmp/initrd").write_bytes(image)
-            stage.in_tools("zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img")
+            compress = ["zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img"]
+            packing.append(lambda: stage.in_tools(*compress))  # on one processor: beside the root
     shutil.move(stage.target / "boot" / f"vmlinuz-{version}", out / "vmlinuz")
     shutil.rmtree(stage.target / "boot")
     (stage.target / "boot").mkdir()
@@ -199,12 +200,13 @@ def main(description_file: str) -> None:
         _settle_times(stage)
         actions = [f'uncompressed@pathname("{pattern.lstrip("/")}")\n' for pattern in _list("uncompressed.list")]
         (stage.tools / "tmp/actions").write_text("".join(actions))
-        stage.in_tools(
+        squash = [
             "env", "-u", "SOURCE_DATE_EPOCH", "mksquashfs", "/target", "/out/root.squashfs", *COMPRESSION,
             "-noappend", "-no-progress", "-exports", "-action-file", "/tmp/actions",
             "-mkfs-time", str(stage.epoch), "-all-time", str(stage.epoch),
             "-wildcards", "-e", "dev/*", "proc/*", "sys/*", "run/*", "tmp/*", "debootstrap",
-        )  # fmt: skip
+        ]  # fmt: skip
+        together.run(*packing, lambda: stage.in_tools(*squash))
     contents |= {"kernel": version, "root_bytes": (out / "root.squashfs").stat().st_size}
     (out / "contents.json").write_text(json.dumps(contents, indent=1, sort_keys=True) + "\n")
 
