@@ -14,6 +14,7 @@ import hashlib
 import os
 import re
 import shutil
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ _IN_USE_S = 3600
 """After its last use by any process."""
 _RESULT = re.compile(r"(.+)-[0-9a-f]{16}(\.part)?")
 _used: set[Path] = set()
+_making: dict[Path, threading.Lock] = {}
 
 
 def digest(*parts: str | bytes | Path) -> str:
@@ -52,10 +54,11 @@ def digest(*parts: str | bytes | Path) -> str:
 
 def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
     """The directory that `make` fills, made once per `kind` and `key`."""
-    final = paths.CACHE / f"{kind}-{key[:16]}"
+    final = paths.CACHE / name(kind, key)
     _used.add(final)
     if not final.exists():
-        with locked(paths.CACHE / f".{final.name}.lock"):
+        # A thread of our own that makes it is no other command to tell of.
+        with _making.setdefault(final, threading.Lock()), locked(paths.CACHE / f".{final.name}.lock"):
             if not final.exists():  # nobody else made it meanwhile
                 _make(final, make)
     os.utime(final)  # it was of use just now: see `clean`
@@ -64,7 +67,12 @@ def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
 
 def has(kind: str, key: str) -> bool:
     """Whether `result` would have nothing to make."""
-    return (paths.CACHE / f"{kind}-{key[:16]}").exists()
+    return (paths.CACHE / name(kind, key)).exists()
+
+
+def name(kind: str, key: str) -> str:
+    """Of a result's directory: other results may be made from it."""
+    return f"{kind}-{key[:16]}"
 
 
 def _make(final: Path, make: Callable[[Path], None]) -> None:

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from flotilla.common import paths, progress
+from flotilla.common import paths, progress, together
 from flotilla.common.errors import UserError
 
 
@@ -108,7 +108,8 @@ def run_logged(title: str, argv: Sequence[str], log: Path, environment: Mapping[
     with log.open("wb") as output:
         process = subprocess.Popen(argv, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
         try:
-            status = process.wait()
+            with together.ending(process):
+                status = process.wait()
         finally:
             process.kill()
     if status != 0:

@@ -37,7 +37,7 @@ _now = time.monotonic
 _output = threading.RLock()
 """Held while a line is written, and while a step's state changes."""
 _running: list[Step] = []
-"""One within the other; the innermost is shown."""
+"""One within the other, or at the same time; the one that began last is shown."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import resource
 import shutil
 import statistics
 import subprocess
@@ -20,7 +21,7 @@ from pathlib import Path
 from flotilla.common import cache, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet, Robot
-from images.builder import build, pool, rootfs
+from images.builder import bench_mkosi, build, pool, rootfs, tools
 from images.builder.lock import Lock, read_lock
 
 _PACKAGES = paths.PROJECT / "images" / "bench-packages.txt"
@@ -28,10 +29,8 @@ _RUNS = 5
 """Of what takes about a second; the median counts."""
 _MANY = 100
 """Robots that are made at once."""
-_NO_MKOSI = (
-    "mkosi: give MKOSI=… to compare: bin/mkosi in a checkout of a release of github.com/systemd/mkosi (25.3 works)"
-)
-_MKOSI_ARCHITECTURES = {"i386": "x86", "amd64": "x86-64"}
+_INITRAMFS = "initrd.img"
+"""Of the robot that is built first."""
 REPORT = paths.BUILD / "reports" / "bench.json"
 
 
@@ -43,6 +42,8 @@ class Row:
     made: str
     """What it produced."""
     seconds: float
+    processor: float
+    """Seconds that its processes took of all processors: other work on the computer moves them less."""
     bytes: int
     """Of what it produced, holes not counted."""
     runs: int
@@ -53,7 +54,12 @@ def bench(fleet: Fleet, first: Robot) -> str:
     others = [other for other in fleet.robots.values() if other.board == first.board and other != first]
     others.sort(key=lambda other: (other.number < first.number, other.number))
     lock = read_lock(first.board)
-    mkosi = mkosi_program()
+    mkosi = bench_mkosi.program()
+    if mkosi and fleet.boards[first.board].kernel != "debian":
+        raise UserError(
+            f"MKOSI={mkosi}: the disk of mkosi takes Debian's kernel and the card's initramfs, and {first.name} has a "
+            f"kernel of our own without one (board {first.board}); name another robot, or leave out MKOSI"
+        )
     subprocess.run([paths.PROJECT / "images" / "install-host-packages", _PACKAGES], check=True)
     pool.fill([lock, read_lock("tools")])
     work = paths.BUILD / "bench"
@@ -65,7 +71,7 @@ def bench(fleet: Fleet, first: Robot) -> str:
         pool.repository(lock, repository)
         rows.append(_mmdebstrap(work, repository, lock))
         if mkosi:
-            rows.append(_mkosi(mkosi, work / "mkosi", repository, lock))
+            rows.append(_mkosi(mkosi, work / "mkosi", repository, lock, work / _INITRAMFS))
     finally:
         cache.discard(work)
     REPORT.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +83,7 @@ def bench(fleet: Fleet, first: Robot) -> str:
     }
     REPORT.write_text(json.dumps(report, indent=1) + "\n")
     lines = [table(rows), f"{os.cpu_count()} cores; load before: {load:.1f}"]
-    return "\n".join(lines if mkosi else [*lines, _NO_MKOSI])
+    return "\n".join(lines if mkosi else [*lines, bench_mkosi.MISSING])
 
 
 def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[Row]:
@@ -97,6 +103,8 @@ def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[R
     rows = [
         _measure(f"cold build of {first.name}: empty cache, packages in the pool", "bootable card", image(first), 1)
     ]
+    for made in (work / "cache").glob(f"rootfs-*/{_INITRAMFS}"):  # one root so far
+        shutil.copyfile(made, work / _INITRAMFS)
     if others:
         title = f"{others[0].name} after {first.name}"
         rows.append(_measure(title, "bootable card", image(others[0]), _RUNS))
@@ -160,44 +168,23 @@ def _mmdebstrap(work: Path, repository: Path, lock: Lock) -> Row:
     return _measure("mmdebstrap, same packages without the kernel", "tar.zst, not bootable", make, 1)
 
 
-def mkosi_program() -> str | None:
-    """The mkosi that the user names; it runs from its checkout, without installation."""
-    if not (named := os.environ.get("MKOSI")):
-        return None
-    if not (program := shutil.which(named)):
-        raise UserError(f"MKOSI={named}: no program; {_NO_MKOSI}")
-    return str(Path(program).resolve())
-
-
-def _mkosi(program: str, directory: Path, repository: Path, lock: Lock) -> Row:
-    """The same packages as mmdebstrap's. A tar needs nothing of systemd's on this computer."""
-    for each in ("workspace", "packages"):
-        (directory / each).mkdir(parents=True)
-    argv = [
-        *(
-            program,
-            f"--directory={directory}",
-            "--build-sources=",
-            "--distribution=debian",
-            f"--release={lock.release}",
-        ),
-        *(f"--architecture={_MKOSI_ARCHITECTURES[lock.architecture]}", f"--local-mirror=file://{repository}"),
-        *("--repository-key-check=no", "--bootable=no", "--with-docs=no", f"--source-date-epoch={lock.epoch}"),
-        *("--format=tar", "--compress-output=zstd", "--output=root"),
-        *(f"--workspace-directory={directory}/workspace", f"--package-cache-dir={directory}/packages"),
-        *(f"--package={name}" for name in _userland(lock)),
-        "build",
-    ]
+def _mkosi(program: str, directory: Path, repository: Path, lock: Lock, initramfs: Path) -> Row:
+    """The same packages, with the kernel, as a disk that starts."""
+    grub = tools.tree(read_lock("tools")) / "usr/lib/grub/i386-pc"
+    bench_mkosi.prepare(directory, lock, grub, initramfs)
+    bench_mkosi.tools(directory / "tools")
+    argv = bench_mkosi.command(program, directory, repository, lock)
 
     def make() -> int:
         _command(argv)
-        return (directory / "root.tar.zst").stat().st_size
+        return _allocated(directory / "disk.raw")
 
-    return _measure("mkosi, same packages without the kernel", "tar.zst, not bootable", make, 1)
+    made = "bootable disk without runtime, overlay and identity; its initramfs was given"
+    return _measure("mkosi, same packages with the kernel", made, make, 1)
 
 
 def _userland(lock: Lock) -> list[str]:
-    """What both public builders install: they take a kernel with all its dependencies only."""
+    """What mmdebstrap installs: it takes a kernel with all its dependencies only."""
     return [package.name for package in lock.having("required", "userland")]
 
 
@@ -215,24 +202,30 @@ def _allocated(path: Path) -> int:
 
 
 def _measure(work: str, made: str, make: Callable[[], int], runs: int) -> Row:
-    seconds = []
+    seconds, processor = [], []
     size = 0
     with progress.step(work) as step:
         for run in range(runs):
             step.at(run, runs, "runs")
-            started = time.monotonic()
+            started, used = time.monotonic(), _processor()
             size = make()
             seconds.append(time.monotonic() - started)
-    return Row(work, made, statistics.median(seconds), size, runs)
+            processor.append(_processor() - used)
+    return Row(work, made, statistics.median(seconds), statistics.median(processor), size, runs)
+
+
+def _processor() -> float:
+    """Seconds that processes took which have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def table(rows: list[Row]) -> str:
     """The rows as text; ratios are to the first."""
-    cells = [("work", "seconds", "ratio", "bytes", "made")]
-    cells += [
-        (row.work, f"{row.seconds:.2f}", f"{row.seconds / rows[0].seconds:.4f}", progress.size(row.bytes), row.made)
-        for row in rows
-    ]
+    cells = [("work", "seconds", "ratio", "processor", "bytes", "made")]
+    for row in rows:
+        figures = (f"{row.seconds:.2f}", f"{row.seconds / rows[0].seconds:.4f}", f"{row.processor:.2f}")
+        cells.append((row.work, *figures, progress.size(row.bytes), row.made))
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = []
     for first, *rest, last in cells:

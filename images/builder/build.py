@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from flotilla.common import cache, host, namespace, paths, progress
+from flotilla.common import cache, host, namespace, paths, progress, together
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity, release_keys
 from flotilla.fleet.apps import BuiltApp
@@ -41,13 +41,20 @@ def image_of(robot: Robot, directory: Path = paths.IMAGES) -> Path:
 def board_build(board: Board, releases: Releases | None = None) -> BoardBuild:
     """Everything up to the identity; from the cache where nothing changed. `releases`: who signs them."""
     lock, tools_lock = board_lock(board), read_lock("tools")
-    pool.fill([lock.without("kernel") if board.kernel == "lean" else lock, tools_lock])
+    fill_pool(board)
+    root = rootfs.build(board, lock, tools_lock)  # first: it unpacks the tools while the runtime is compiled
     toolset = tools.Tools(tools.tree(tools_lock), lock.epoch)
-    root = rootfs.build(board, lock, tools_lock)
     content = slot.build(board, root, release_keys.document(releases or Releases()), slot.release())
     base = card.base(board, content, toolset, lock.epoch)
     described = manifest.shared(board, (lock, tools_lock), root, content, base, toolset)
     return BoardBuild(board, lock, tools_lock, toolset, root, content, base, described)
+
+
+def fill_pool(board: Board) -> None:
+    """Download what the build of a board lacks, all of it at once."""
+    lock = board_lock(board)
+    wanted = runtime.wanted(board.system)
+    pool.fill([lock.without("kernel") if board.kernel == "lean" else lock, read_lock("tools"), *wanted])
 
 
 def build(
@@ -63,11 +70,17 @@ def build(
     host.check()
     namespace.check()
     with cache.exclusive():
-        check_tasks(fleet, robots)
         boards: dict[str, BoardBuild] = {}
-        for robot in robots:
-            if robot.board not in boards:
-                boards[robot.board] = board_build(fleet.boards[robot.board], fleet.releases)
+        names = dict.fromkeys(robot.board for robot in robots)
+        for name in names:
+            fill_pool(fleet.boards[name])
+
+        def make_boards() -> None:
+            for name in names:
+                boards[name] = board_build(fleet.boards[name], fleet.releases)
+
+        # At once, because the tasks wait for the runtime, beside which the root is made.
+        together.run(lambda: check_tasks(fleet, robots), make_boards)
         images = _robot_images(fleet, robots, boards, directory, apps or {})
         for made in boards.values():
             if missing := made.lock.missing_suites:
@@ -89,7 +102,8 @@ def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
     for robot in robots:
         for name, task in identity.control_tasks(fleet, robot).items():
             try:
-                runtime.check_task(paths.TASKS / f"{name}.yml", task)
+                system = fleet.boards[robot.board].system  # whose runtime is built anyway
+                runtime.check_task(paths.TASKS / f"{name}.yml", task, system=system)
             except UserError as error:
                 problems.append(f"{robot.name}: {error}")
     if problems:

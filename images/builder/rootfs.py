@@ -17,10 +17,10 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from flotilla.common import cache, namespace, paths, progress
+from flotilla.common import cache, namespace, paths, progress, together
 from flotilla.fleet.model import Board
 from images.builder import debian_kernel, initramfs, kernel, pool, runtime, tools
 from images.builder.chroot import Chroot, mount
@@ -32,10 +32,12 @@ COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
 _SIZE_LIMIT = "3g"
 _BOOTSTRAP = "debootstrap"
-_SECONDS = {_BOOTSTRAP: 80, "kernel": 10, "runtime": 1, "overlay": 1, "clean": 0, "initramfs": 6, "squashfs": 50}
+_SECONDS = {_BOOTSTRAP: 80, "kernel": 10, "runtime": 1, "overlay": 1, "clean": 0, "initramfs": 1, "squashfs": 55}
 """The stage's parts, in their order, and about how long each takes on two cores: how far a build is."""
 _PACKAGE = re.compile(r"^I: (?:Unpacking|Configuring) [^ ]+\.\.\.$", re.MULTILINE)
 """What debootstrap says of a package, twice of each."""
+_RUNTIME = "runtime"
+"""A pipe in the stage's repository. It says the name of the runtime's package there, as soon as that is compiled."""
 _STAGE_FILES = ("rootfs.py", "chroot.py", "debian_kernel.py", "initramfs.py", "init")
 
 
@@ -47,13 +49,12 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     own = kernel.board_kernel(board) if board.kernel == "lean" else None
     if own:
         lock = lock.without("kernel")
-    drivers = runtime.build(board.system)
     sources = [Path(__file__).parent / name for name in _STAGE_FILES]
     key = cache.digest(
         lock.digest,
         tools_lock.digest,
         own.directory.name if own else "",
-        drivers.directory.name,
+        runtime.name(board.system),
         debian_kernel.PACKER,
         board.model_dump_json(include={"disk_modules", "architecture", "console"}),
         _DATA,
@@ -62,29 +63,39 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     )
 
     def make(out: Path) -> None:
-        toolset = tools.tree(tools_lock)
+        """The runtime is compiled meanwhile: the stage needs it late, and leaves a processor idle until then."""
+        (out / "repository").mkdir()
+        os.mkfifo(out / "repository" / _RUNTIME)
+        with (out / "repository" / _RUNTIME).open("r+b", buffering=0) as name:  # both ways, so that nobody waits here
+
+            def compile_runtime() -> None:
+                package = runtime.build(board.system).package
+                shutil.copy(package, out / "repository")
+                name.write(f"{package.name}\n".encode())
+
+            together.run(compile_runtime, lambda: make_root(out))
+
+    def make_root(out: Path) -> None:
         log = paths.BUILD / f"rootfs-{board.name}.log"
         log.unlink(missing_ok=True)  # an earlier build's
         packages = lock.having("required", "userland")
         title = f"root file system of {board.name} ({len(lock.packages)} packages)"
         with progress.step(title, lambda: far(progress.text(log), len(packages))):
             repository = out / "repository"
-            pool.repository(lock, repository)
+            together.run(lambda: tools.tree(tools_lock), lambda: pool.repository(lock, repository))
             kernels = [package.path for package in lock.having("kernel")]
             if own:
                 shutil.copy(own.package, repository)
                 kernels = [own.package.name]
-            shutil.copy(drivers.package, repository)
             stage = {
                 "architecture": lock.architecture,
                 "release": lock.release,
                 "epoch": lock.epoch,
                 "packages": [package.name for package in packages],
                 "kernels": kernels,
-                "runtime": drivers.package.name,
                 "disk_modules": None if own else board.disk_modules,
                 "console": board.console.tty,
-                "tools": str(toolset),
+                "tools": str(tools.tree(tools_lock)),
                 "repository": str(repository),
                 "out": str(out),
             }
@@ -164,7 +175,9 @@ def main(description_file: str) -> None:
     with _timed("kernel"):
         version = _kernel(stage, description["architecture"], description["kernels"])
     with _timed("runtime"):
-        shutil.copy(stage.tools / "repository" / description["runtime"], stage.target / "tmp/runtime.deb")
+        with (stage.tools / "repository" / _RUNTIME).open() as name:
+            package = name.readline().rstrip()  # once it is compiled
+        shutil.copy(stage.tools / "repository" / package, stage.target / "tmp/runtime.deb")
         stage.in_target("dpkg", "--install", "/tmp/runtime.deb")
         (stage.target / "tmp/runtime.deb").unlink()
     with _timed("overlay"):
@@ -174,11 +187,13 @@ def main(description_file: str) -> None:
     with _timed("clean"):
         contents = _clean(stage)
     out = Path(description["out"])
+    packing: list[Callable[[], object]] = []
     if description["disk_modules"] is not None:
         with _timed("initramfs"):
             image = initramfs.build(stage.tools, stage.target, version, description["disk_modules"])
             (stage.tools / "tmp/initrd").write_bytes(image)
-            stage.in_tools("zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img")
+            compress = ["zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img"]
+            packing.append(lambda: stage.in_tools(*compress))  # on one processor: beside the root
     shutil.move(stage.target / "boot" / f"vmlinuz-{version}", out / "vmlinuz")
     shutil.rmtree(stage.target / "boot")
     (stage.target / "boot").mkdir()
@@ -186,12 +201,13 @@ def main(description_file: str) -> None:
         _settle_times(stage)
         actions = [f'uncompressed@pathname("{pattern.lstrip("/")}")\n' for pattern in _list("uncompressed.list")]
         (stage.tools / "tmp/actions").write_text("".join(actions))
-        stage.in_tools(
+        squash = [
             "env", "-u", "SOURCE_DATE_EPOCH", "mksquashfs", "/target", "/out/root.squashfs", *COMPRESSION,
             "-noappend", "-no-progress", "-exports", "-action-file", "/tmp/actions",
             "-mkfs-time", str(stage.epoch), "-all-time", str(stage.epoch),
             "-wildcards", "-e", "dev/*", "proc/*", "sys/*", "run/*", "tmp/*", "debootstrap",
-        )  # fmt: skip
+        ]  # fmt: skip
+        together.run(*packing, lambda: stage.in_tools(*squash))
     contents |= {"kernel": version, "root_bytes": (out / "root.squashfs").stat().st_size}
     (out / "contents.json").write_text(json.dumps(contents, indent=1, sort_keys=True) + "\n")
 
@@ -207,6 +223,9 @@ def _bootstrap(stage: Stage, architecture: str, release: str, packages: list[str
     config = ["force-unsafe-io", *(f"path-{'include' if keep else 'exclude'}={pattern}" for keep, pattern in rules)]
     (stage.target / "etc/dpkg/dpkg.cfg.d").mkdir(parents=True, exist_ok=True)
     (stage.target / "etc/dpkg/dpkg.cfg.d/flotilla").write_text("\n".join(config) + "\n")
+    (stage.target / "etc/ssh").mkdir()
+    for kind in ("rsa", "ecdsa", "ed25519"):  # so that the server's package draws none, which takes seconds
+        (stage.target / f"etc/ssh/ssh_host_{kind}_key").touch()  # leftovers.list has them
     stage.shown_in_target("/debootstrap/debootstrap", "--second-stage")
 
 

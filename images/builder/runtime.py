@@ -15,7 +15,7 @@ from flotilla.common import cache, namespace, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import System
 from images.builder import pool, runtime_stage, toolchain, tools
-from images.builder.lock import HOST, read_lock, runtime_lock
+from images.builder.lock import HOST, Lock, read_lock, runtime_lock
 
 SOURCE = paths.PROJECT / "runtime"
 _LIBRARIES = ("libc6", "libddsc0debian", "libdc1394-25", "libnettle8", "libsystemd0", "libyaml-0-2")
@@ -28,6 +28,8 @@ _LOADERS = {
     "i386": ("lib/ld-linux.so.2", "usr/lib/i386-linux-gnu"),
 }
 """The dynamic loader and the libraries in a tree of an architecture. A 64-bit PC runs programs for both."""
+_KIND = "runtime"
+"""Of results in the cache."""
 _LEFT_OUT = ("bench", "tests", "tidy.py")
 """Folders of the source that no package comes from."""
 
@@ -169,7 +171,17 @@ def build(system: System) -> Runtime:
             arguments = [str(tree), str(out), system.architecture, str(lock.epoch), json.dumps(libraries(system))]
             namespace.run_stage(runtime_stage.__name__, arguments, log)
 
-    return Runtime(cache.result("runtime", key(system), make))
+    return Runtime(cache.result(_KIND, key(system), make))
+
+
+def name(system: System) -> str:
+    """Of the directory of what `build` makes; it need not be made yet."""
+    return cache.name(_KIND, key(system))
+
+
+def wanted(system: System) -> list[Lock]:
+    """What `build` would have to find in the pool, which it fills otherwise."""
+    return [] if cache.has(_KIND, key(system)) else [read_lock(runtime_lock(system))]
 
 
 def far(log: str) -> progress.Far:

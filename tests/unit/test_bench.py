@@ -2,34 +2,50 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
-from images.builder import bench_robots
-from images.builder.bench import Row, mkosi_program, table
+from images.builder import bench, bench_mkosi, bench_robots, card
+from images.builder.bench import Row, table
+from images.builder.lock import read_lock
 
 
 def test_table_has_ratios_to_the_first_row() -> None:
-    rows = [Row("cold", "card", 60.0, 1 << 20, 1), Row("next", "card", 0.6, 512, 5)]
+    rows = [Row("cold", "card", 60.0, 85.5, 1 << 20, 1), Row("next", "card", 0.6, 0.7, 512, 5)]
     assert table(rows).splitlines() == [
-        "work  seconds   ratio    bytes  made",
-        "cold    60.00  1.0000  1.0 MiB  card",
-        "next     0.60  0.0100    512 B  card",
+        "work  seconds   ratio  processor    bytes  made",
+        "cold    60.00  1.0000      85.50  1.0 MiB  card",
+        "next     0.60  0.0100       0.70    512 B  card",
     ]
+
+
+def test_a_row_has_the_processor_time_of_its_processes() -> None:
+    burn = "import time\nwhile time.process_time() < 0.3: pass"
+
+    def make() -> int:
+        subprocess.run([sys.executable, "-c", burn], check=True)
+        return 7
+
+    row = bench._measure("work", "made", make, 3)
+    assert row.processor >= 0.3
+    assert (row.bytes, row.runs) == (7, 3)
 
 
 def test_mkosi_is_the_users_to_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MKOSI", raising=False)
-    assert mkosi_program() is None
+    assert bench_mkosi.program() is None
     program = tmp_path / "mkosi"
     monkeypatch.setenv("MKOSI", str(program))
     with pytest.raises(UserError, match=r"MKOSI=.*/mkosi: no program; .*bin/mkosi"):
-        mkosi_program()
+        bench_mkosi.program()
     program.touch(mode=0o755)
-    assert mkosi_program() == str(program)
+    assert bench_mkosi.program() == str(program)
 
 
 def test_further_robots_take_what_is_free(fleet: Fleet) -> None:
@@ -42,3 +58,51 @@ def test_further_robots_take_what_is_free(fleet: Fleet) -> None:
     assert all(robot.address in fleet.network.subnet for robot in made)
     with pytest.raises(UserError, match=r"^300 robots are to be measured, and the fleet has .* for 246 more"):
         bench_robots.like(fleet, one, 300)
+
+
+def test_mkosi_makes_a_disk_like_the_card(tmp_path: Path) -> None:
+    grub, initramfs = tmp_path / "grub", tmp_path / "initrd"
+    grub.mkdir()
+    (grub / "normal.mod").write_text("module")
+    initramfs.write_text("archive")
+    lock, directory = read_lock("smartcoret3"), tmp_path / "mkosi"
+    bench_mkosi.prepare(directory, lock, grub, initramfs)
+    parts = [file.read_text() for file in sorted((directory / "partitions").iterdir())]
+    assert ["Type=root-x86" in part for part in parts] == [False, False, True, False, False]
+    assert "Format=squashfs\n" in parts[2]
+    assert "CompressionLevel=15\n" in parts[2]
+    assert f"SizeMinBytes={card.LAYOUT.slot_mib}M\n" in parts[3]
+    assert (directory / "grub/usr/lib/grub/i386-pc/normal.mod").read_text() == "module"
+    rules = (directory / "sandbox/etc/dpkg/dpkg.cfg.d/flotilla").read_text().splitlines()
+    assert rules.index("path-exclude=/usr/share/doc/*") < rules.index("path-include=/usr/share/doc/*/copyright")
+    stub = subprocess.run(
+        ["dpkg-deb", "--field", directory / "stubs/stub_1_all.deb", "Provides"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert "linux-initramfs-tool" in stub.stdout
+
+    argv = bench_mkosi.command("bin/mkosi", directory, tmp_path / "repository", lock)
+    assert {f"--package={package.name}" for package in lock.packages} < set(argv)
+    assert {"--format=disk", "--bios-bootloader=grub", "--architecture=x86"} < set(argv)
+    (arguments,) = (each for each in argv if each.startswith("--kernel-command-line="))
+    assert "root=PARTUUID=00000000-03 " in arguments  # as images/builder/init reads it
+    (ata,) = (
+        each.partition("=")[2] for each in argv if each.startswith("--kernel-modules-include=") and "pata" in each
+    )
+    assert re.search(ata, "drivers/ata/pata_via.ko")
+    assert not re.search(ata, "sound/drivers/ata/pata_via.ko")
+
+
+def test_mkosi_is_not_compared_with_a_kernel_of_our_own(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "mkosi"
+    program.touch(mode=0o755)
+    monkeypatch.setenv("MKOSI", str(program))
+    one = fleet.robots[3]
+    lean = fleet.boards[one.board].model_copy(update={"kernel": "lean"})
+    changed = fleet.model_copy(update={"boards": fleet.boards | {one.board: lean}})
+    with pytest.raises(UserError, match=r"mkosi: .*robot3 has a kernel of our own .*; name another robot"):
+        bench.bench(changed, one)

@@ -164,6 +164,7 @@ def test_two_processes_make_a_result_once() -> None:
 
     def same() -> None:
         started.wait(10)
+        cache._making.clear()  # of which another process knows nothing
         cache.result("kind", "0123456789abcdef", lambda out: made.append(False))
 
     other = threading.Thread(target=same)
@@ -171,6 +172,27 @@ def test_two_processes_make_a_result_once() -> None:
     cache.result("kind", "0123456789abcdef", slow)
     other.join(10)
     assert made == [True]
+
+
+def test_two_threads_make_a_result_once_and_speak_of_no_other_command(capsys: pytest.CaptureFixture[str]) -> None:
+    started = threading.Event()
+    made: list[Path] = []
+
+    def slow(out: Path) -> None:
+        started.set()
+        other.join(0.2)  # would be done by then, if it did not wait
+        made.append(out)
+
+    def same() -> None:
+        started.wait(10)
+        cache.result("kind", "0123456789abcdef", made.append)
+
+    other = threading.Thread(target=same)
+    other.start()
+    cache.result("kind", "0123456789abcdef", slow)
+    other.join(10)
+    assert len(made) == 1
+    assert "another command" not in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("_results")

@@ -162,6 +162,7 @@ def test_every_build_says_in_one_line_what_its_lock_lacks(
     monkeypatch.setattr("images.builder.build.namespace.check", lambda: None)
     monkeypatch.setattr("images.builder.build.cache.exclusive", nullcontext)
     monkeypatch.setattr(build, "check_tasks", lambda *_: None)
+    monkeypatch.setattr(build, "fill_pool", lambda _: None)
     monkeypatch.setattr(build, "board_build", lambda board, _: SimpleNamespace(lock=locks[board.name]))
     monkeypatch.setattr(build, "_robot_images", lambda *_: [])
     build.build(fleet, [fleet.robots[number] for number in (1, 2, 3)])
