@@ -323,11 +323,18 @@ def _configure(stage: Stage, console: str) -> None:
     stage.in_target("systemctl", "set-default", "multi-user.target")
     stage.in_target("systemctl", "enable", f"serial-getty@{console}.service")
     (stage.target / "data").mkdir()
-    # Debian 13 makes these links at each boot, to files that it wants moved there; the robot would differ from its image.
-    links = ["etc/default/locale", "etc/vconsole.conf"]
-    if any(f" /{links[0]} " in file.read_text() for file in (stage.target / "usr/lib/tmpfiles.d").glob("debian.conf")):
-        (stage.target / links[0]).rename(stage.target / "etc/locale.conf")
-        stage.in_target("systemd-tmpfiles", "--create", *(f"--prefix=/{link}" for link in links))
+    _link_moved_files(stage.target)
+
+
+def _link_moved_files(target: Path) -> None:
+    """Make the links that Debian 13 makes at each boot, from former places of files: the robot would differ from its
+    image. Debian 12 makes none of them."""
+    text = (target / "usr/lib/tmpfiles.d/debian.conf").read_text()
+    for place, to in re.findall(r"^L\+ /(etc/default/locale|etc/vconsole\.conf) .* (\S+)$", text, re.MULTILINE):
+        link = target / place
+        if link.exists():
+            link.rename(link.parent / to)
+        link.symlink_to(to)
 
 
 def _clean(stage: Stage) -> dict[str, object]:
