@@ -93,7 +93,7 @@ def tools(directory: Path, source: str | None = None) -> None:
 
 def command(mkosi: str, directory: Path, repository: Path, lock: Lock) -> list[str]:
     """What makes `directory`/disk.raw of `prepare`'s files, `tools`' in `directory`/tools, and a package repository."""
-    modules = [f"^{fnmatch.translate(f'{pattern}.ko')}" for pattern in _modules()]
+    modules = [f"^{fnmatch.translate(f'{pattern}.ko')}" for pattern in rootfs.module_patterns(lock.architecture)]
     return [
         mkosi, f"--directory={directory}", "--build-sources=", "--distribution=debian", f"--release={lock.release}",
         f"--architecture={_ARCHITECTURES[lock.architecture]}", f"--local-mirror=file://{repository}",
@@ -127,12 +127,6 @@ def _partitions(architecture: str) -> dict[str, list[str]]:
         "4-slot": of("linux-generic", card.LAYOUT.slot_mib),
         "5-data": of("linux-generic", card.LAYOUT.data_mib, "Format=ext4"),
     }
-
-
-def _modules() -> list[str]:
-    """Patterns of the kernel modules that the card keeps."""
-    lines = (paths.PROJECT / "images/rootfs/modules.list").read_text().splitlines()
-    return [pattern for line in lines if (pattern := line.split("#")[0].strip())]
 
 
 def _run(argv: list[str]) -> None:

@@ -234,6 +234,12 @@ def _list(name: str) -> list[str]:
     return [entry for line in (_DATA / name).read_text().splitlines() if (entry := line.split("#")[0].strip())]
 
 
+def module_patterns(architecture: str) -> list[str]:
+    """Which kernel modules to keep: shell patterns over their path below kernel/, without .ko."""
+    own = f"modules-{architecture}.list"
+    return _list("modules.list") + (_list(own) if (_DATA / own).is_file() else [])
+
+
 def path_rules() -> list[tuple[bool, str]]:
     """What to keep (True) or leave out, as shell patterns; the last that matches counts."""
     rules = []
@@ -280,8 +286,7 @@ def _prune_modules(stage: Stage, architecture: str, version: str) -> None:
     stage.in_tools("depmod", "-b", "/target", version)
     needs = dict(line.split(":", 1) for line in (directory / "modules.dep").read_text().splitlines())
     kept: set[str] = set()
-    own = f"modules-{architecture}.list"
-    for pattern in _list("modules.list") + (_list(own) if (_DATA / own).is_file() else []):
+    for pattern in module_patterns(architecture):
         for module in fnmatch.filter(needs, f"kernel/{pattern}.ko*"):
             kept |= {module, *needs[module].split()}
     for path in sorted((directory / "kernel").rglob("*.ko*")):

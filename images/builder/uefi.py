@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from images.builder.tools import Tools
 
-_PROGRAM = "EFI/BOOT/BOOTX64.EFI"
+_PROGRAM = PurePosixPath("EFI/BOOT/BOOTX64.EFI")
 """UEFI specification 2.10, 3.5.1.1 "Removable Media Boot Behavior"."""
 _VOLUME = "464C4F54"
 
@@ -22,8 +22,7 @@ def system_partition(tools: Tools, work: Path, size: int, program: bytes) -> byt
     with image.open("wb") as empty:
         empty.truncate(size)
     tools.run("usr/sbin/mkfs.fat", "-F", "16", "-s", "1", "-i", _VOLUME, "-n", "SYSTEM", "--invariant", image)
-    *directories, _ = [_PROGRAM[:at] for at, letter in enumerate(_PROGRAM) if letter == "/"] + [""]
-    for directory in directories:
+    for directory in _PROGRAM.parents[-2::-1]:
         tools.run("usr/bin/mmd", "-i", image, f"::{directory}")
     tools.run("usr/bin/mcopy", "-i", image, file, f"::{_PROGRAM}")
     content = image.read_bytes()

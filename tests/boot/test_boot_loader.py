@@ -24,8 +24,8 @@ from lab.qemu.boot_loader import BootLoader, Started, State, StubCard, header_pl
 
 ROBOT = 3
 UEFI_ROBOT = 2
-_STATES = 288
-"""States that can be written, with the tries that can be counted."""
+_STATES = list(itertools.product(("A B", "B A"), ("A", "B", "AB"), ("", "A", "B"), range(4), range(4)))
+"""Order, good slots and slot on trial of all states that can be written, with the tries that can be counted."""
 SEED = 3
 SECONDS = 600
 """Limit for what takes half a minute on an idle host."""
@@ -177,8 +177,8 @@ def test_every_state_leads_to_its_slot(loader: BootLoader, every: int) -> None:
     Seen to fail, with every seventh, where A's tries are never read, where A is good whatever the state says, where a
     third try does not end A, and without the word `flotilla.trial`.
     """
-    for number in range(0, _STATES, every):
-        _check_state(loader, number)
+    for state in _STATES[::every]:
+        _check_state(loader, *state)
 
 
 def test_every_state_leads_to_its_slot_with_uefi(fleet: Fleet, tmp_path: Path) -> None:
@@ -189,14 +189,12 @@ def test_every_state_leads_to_its_slot_with_uefi(fleet: Fleet, tmp_path: Path) -
     robot = inventory.robot(fleet, UEFI_ROBOT)
     stubbed = StubCard(image_of(robot), tmp_path / "stub")
     with BootLoader(fleet.boards[robot.board], stubbed, tmp_path / "uefi") as loader:
-        for number in range(0, _STATES, 41):
-            _check_state(loader, number)
+        for state in _STATES[::41]:
+            _check_state(loader, *state)
 
 
-def _check_state(loader: BootLoader, number: int) -> None:
-    """Judge one of the states that can be written, with the tries that can be counted."""
-    states = itertools.product(("A B", "B A"), ("A", "B", "AB"), ("", "A", "B"), range(4), range(4))
-    order, good, trial, a, b = next(itertools.islice(states, number, None))
+def _check_state(loader: BootLoader, order: str, good: str, trial: str, a: int, b: int) -> None:
+    """Judge a start with one of `_STATES`."""
     content = card.state_copy(5, order=order, good=good, trial=trial)
     name = f"{order}, good {good}, trial {trial}, tries {a} {b}"
     started = check(loader, name, {**copies(content), **tries(5, a, b)})

@@ -27,8 +27,7 @@ _STANDING = {robot.board: robot.number for robot in reversed(_FLEET.robots.value
 _STANDING[_FLEET.robots[PENTIUM].board] = PENTIUM
 """The robots that stand for their boards: the first one each, but for that one."""
 SYSTEMS = [
-    pytest.param(
-        (number, "debian"), id=f"{board}-debian")
+    pytest.param((number, "debian"), id=f"{board}-debian")
     for board, number in sorted(_STANDING.items())
 ] + [  # after those whose kernel has not to be built
     pytest.param(
