@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
@@ -57,6 +58,12 @@ def run(*works: Callable[[], object]) -> None:
                 raise
     finally:
         _group.reset(token)
+
+
+def at_low_priority(work: Callable[[], object]) -> None:
+    """Do it in a thread of the lowest priority, which what it starts has, too: other work goes first."""
+    with ThreadPoolExecutor(1, initializer=os.nice, initargs=(19,)) as thread:
+        thread.submit(copy_context().run, work).result()
 
 
 @contextmanager

@@ -13,9 +13,11 @@ from __future__ import annotations
 import lzma
 import struct
 from io import BytesIO
+from pathlib import Path
 
 import lz4
 import lz4.block
+from debian.debfile import DebFile
 from elftools.elf.elffile import ELFFile
 
 from flotilla.common.errors import UserError
@@ -30,6 +32,15 @@ _XZ = b"\xfd7zXZ\0"
 _STUB_BYTES = 128
 _LOADED_AT = 0x100000
 """Where boot loaders put the part of a kernel that is not relocatable."""
+
+
+def of_package(package: Path) -> bytes:
+    """The kernel in a Debian package, as robots boot it."""
+    with package.open("rb") as content:
+        archive = DebFile(fileobj=content).data.tgz()
+        kernel = archive.extractfile(next(member for member in archive if member.name.startswith("./boot/vmlinuz-")))
+        assert kernel
+        return repacked(kernel.read())
 
 
 def repacked(kernel: bytes) -> bytes:

@@ -7,7 +7,6 @@ import hashlib
 import os
 import re
 import shutil
-import subprocess
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -17,7 +16,7 @@ from urllib.parse import quote
 
 from flotilla.common import cache, paths, progress
 from flotilla.common.errors import UserError
-from images.builder import mirror
+from images.builder import deb, mirror
 from images.builder.lock import Lock, Package
 from images.builder.mirror import Mirrors
 
@@ -75,21 +74,30 @@ def verify_hashes(lock: Lock) -> None:
         raise UserError("\n".join(wrong))
 
 
-def repository(lock: Lock, directory: Path) -> None:
+def repository(lock: Lock, directory: Path, *, compressed: bool = True) -> None:
     """A package repository of just the lock's packages, which it verifies; no signature, so it is for
 
     `debootstrap --no-check-gpg --variant=minbase RELEASE TARGET file://DIRECTORY`.
+
+    `compressed`: as Debian has them. debootstrap unpacks what is required twice, and dpkg one package after the other,
+    so that without compression is sooner; the kernel, which neither touches at first, stays as it is.
     """
     verify_hashes(lock)
     index = directory / "dists" / lock.release / "main" / f"binary-{lock.architecture}"
     index.mkdir(parents=True)
+
+    def add(package: Package) -> str:
+        """Its stanza in the index."""
+        place = directory / package.path
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if compressed or package.role == "kernel":
+            _link(file(package), place)
+            return _stanza(package, package.size, package.sha256)
+        deb.without_compression(file(package), place)
+        return _stanza(package, place.stat().st_size, _hash(place))
+
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        controls = threads.map(control, lock.packages)
-    stanzas = []
-    for package, described in zip(lock.packages, controls, strict=True):
-        _link(file(package), directory / package.path)
-        stanzas.append(_stanza(package, described))
-    content = "".join(stanzas).encode()
+        content = "".join(threads.map(add, lock.packages)).encode()
     (index / "Packages").write_bytes(content)
     (index.parents[1] / "Release").write_text(
         f"Origin: Debian\nSuite: {lock.release}\nCodename: {lock.release}\n"
@@ -248,27 +256,25 @@ def _receive(address: str, beside: Path, count: Callable[[int], None]) -> tuple[
 
 def control(package: Package) -> str:
     """The package's own description of itself. UserError where the pool's file is damaged."""
-    argv = ["dpkg-deb", "--field", str(file(package))]
-    done = subprocess.run(argv, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise UserError(f"package {package}: {done.stderr.strip()}; delete {paths.shown(file(package))} and run again")
-    return done.stdout
+    try:
+        return deb.control(file(package))
+    except ValueError as error:
+        raise UserError(f"package {package}: {error}; delete {paths.shown(file(package))} and run again") from error
 
 
-def _stanza(package: Package, described: str) -> str:
+def _stanza(package: Package, size: int, sha256: str) -> str:
     """Its stanza in the repository's index. The archive's word on what is required stands above the package's own.
 
     debootstrap misses a stanza that no empty line ends.
     """
-    kept = re.sub(r"^Priority: .*\n", "", described, flags=re.MULTILINE)
+    kept = re.sub(r"^Priority: .*\n", "", control(package), flags=re.MULTILINE)
     return (
         f"{kept.rstrip()}\nPriority: {'required' if package.role == 'required' else 'optional'}\n"
-        f"Filename: {package.path}\nSize: {package.size}\nSHA256: {package.sha256}\n\n"
+        f"Filename: {package.path}\nSize: {size}\nSHA256: {sha256}\n\n"
     )
 
 
 def _link(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
     try:
         target.hardlink_to(source)
     except OSError as error:

@@ -1,7 +1,8 @@
 """The root file system that all robots of a board share: read-only, compressed, bit-identical.
 
 `build` prepares the inputs and runs this module again as a stage in namespaces (`main`), where debootstrap makes the
-root in memory from the local repository, the overlay is laid over it, and mksquashfs packs it.
+smallest Debian in memory from the local repository, dpkg adds all other packages, the overlay is laid over it, and
+mksquashfs packs it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 
 from flotilla.common import cache, namespace, paths, progress, together
 from flotilla.fleet.model import Board
-from images.builder import debian_kernel, initramfs, kernel, pool, runtime, tools
+from images.builder import deb, debian_kernel, initramfs, kernel, pool, runtime, tools
 from images.builder.chroot import Chroot, mount
 from images.builder.lock import Lock
 
@@ -31,14 +32,16 @@ COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-
 """zstd: a Pentium III unpacks it several times faster than xz, at about 8 % more bytes. A boot reads hundreds of small
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
 _SIZE_LIMIT = "3g"
-_BOOTSTRAP = "debootstrap"
-_SECONDS = {_BOOTSTRAP: 80, "kernel": 10, "runtime": 1, "overlay": 1, "clean": 0, "initramfs": 1, "squashfs": 55}
+_PACKAGES = "packages"
+_SECONDS = {_PACKAGES: 80, "kernel": 5, "runtime": 1, "overlay": 1, "clean": 0, "initramfs": 1, "squashfs": 55}
 """The stage's parts, in their order, and about how long each takes on two cores: how far a build is."""
-_PACKAGE = re.compile(r"^I: (?:Unpacking|Configuring) [^ ]+\.\.\.$", re.MULTILINE)
-"""What debootstrap says of a package, twice of each."""
+_PACKAGE = re.compile(r"^(?:I: (?:Unpacking|Configuring) [^ ]+|(?:Unpacking|Setting up) \S+ .*)\.\.\.$", re.MULTILINE)
+"""What debootstrap and dpkg say of a package, twice of each."""
 _RUNTIME = "runtime"
 """A pipe in the stage's repository. It says the name of the runtime's package there, as soon as that is compiled."""
-_STAGE_FILES = ("rootfs.py", "chroot.py", "debian_kernel.py", "initramfs.py", "init")
+_REPOSITORY = "/tmp/repository"
+"""Where the root has the stage's repository while it is made; nothing of /tmp is packed."""
+_STAGE_FILES = ("rootfs.py", "chroot.py", "deb.py", "debian_kernel.py", "initramfs.py", "init")
 
 
 def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
@@ -78,21 +81,21 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     def make_root(out: Path) -> None:
         log = paths.BUILD / f"rootfs-{board.name}.log"
         log.unlink(missing_ok=True)  # an earlier build's
-        packages = lock.having("required", "userland")
+        required, userland = lock.having("required"), lock.having("userland")
+        packages = len(required) + len(userland)
         title = f"root file system of {board.name} ({len(lock.packages)} packages)"
-        with progress.step(title, lambda: far(progress.text(log), len(packages))):
+        with progress.step(title, lambda: far(progress.text(log), packages)):
             repository = out / "repository"
-            together.run(lambda: tools.tree(tools_lock), lambda: pool.repository(lock, repository))
-            kernels = [package.path for package in lock.having("kernel")]
+            together.run(lambda: tools.tree(tools_lock), lambda: pool.repository(lock, repository, compressed=False))
             if own:
                 shutil.copy(own.package, repository)
-                kernels = [own.package.name]
             stage = {
                 "architecture": lock.architecture,
                 "release": lock.release,
                 "epoch": lock.epoch,
-                "packages": [package.name for package in packages],
-                "kernels": kernels,
+                "required": [package.name for package in required],
+                "others": [package.path for package in userland],
+                "kernel": own.package.name if own else lock.having("kernel")[0].path,
                 "disk_modules": None if own else board.disk_modules,
                 "console": board.console.tty,
                 "tools": str(tools.tree(tools_lock)),
@@ -103,7 +106,6 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             namespace.run_stage(__name__, [str(out / "stage.json")], log)
             shutil.rmtree(repository)
             (out / "stage.json").unlink()
-            (out / "vmlinuz").write_bytes(debian_kernel.repacked((out / "vmlinuz").read_bytes()))
 
     return cache.result("rootfs", key, make)
 
@@ -114,7 +116,7 @@ def far(log: str, packages: int) -> progress.Far:
     if not begun:
         return progress.Far(0, sum(_SECONDS.values()), part="repository")
     *ended, part = begun
-    share = _SECONDS[part] * len(_PACKAGE.findall(log)) / (2 * packages) if part == _BOOTSTRAP else 0
+    share = _SECONDS[part] * len(_PACKAGE.findall(log)) / (2 * packages) if part == _PACKAGES else 0
     return progress.Far(sum(_SECONDS[name] for name in ended) + share, sum(_SECONDS.values()), part=part)
 
 
@@ -169,24 +171,26 @@ def main(description_file: str) -> None:
     stage.mount(description["repository"], description["out"])
     print(f"clock of the stage: {time.strftime('%F')}")
     stage.in_tools("date", "+clock of the tools: %F")
-    with _timed(_BOOTSTRAP):
-        _bootstrap(stage, description["architecture"], description["release"], description["packages"])
+    repository, out = Path(description["repository"]), Path(description["out"])
+    with _timed(_PACKAGES):
+        together.run(
+            lambda: _prepare_kernel(repository / description["kernel"], out / "vmlinuz"),
+            lambda: _bootstrap(stage, description["architecture"], description["release"], description["required"]),
+        )
+        _install(stage, repository, [*description["others"], description["kernel"]])
     stage.in_target("perl", "-MPOSIX=strftime", "-e", 'print strftime("clock of the target: %F\\n", gmtime)')
     with _timed("kernel"):
-        version = _kernel(stage, description["architecture"], description["kernels"])
+        version = _prune_modules(stage, description["architecture"])
     with _timed("runtime"):
-        with (stage.tools / "repository" / _RUNTIME).open() as name:
+        with (repository / _RUNTIME).open() as name:
             package = name.readline().rstrip()  # once it is compiled
-        shutil.copy(stage.tools / "repository" / package, stage.target / "tmp/runtime.deb")
-        stage.in_target("dpkg", "--install", "/tmp/runtime.deb")
-        (stage.target / "tmp/runtime.deb").unlink()
+        stage.in_target("dpkg", "--install", f"{_REPOSITORY}/{package}")
     with _timed("overlay"):
         _remove_excluded(stage.target)
         _lay_overlay(stage.target)
         _configure(stage, description["console"])
     with _timed("clean"):
         contents = _clean(stage)
-    out = Path(description["out"])
     packing: list[Callable[[], object]] = []
     if description["disk_modules"] is not None:
         with _timed("initramfs"):
@@ -194,7 +198,6 @@ def main(description_file: str) -> None:
             (stage.tools / "tmp/initrd").write_bytes(image)
             compress = ["zstd", "-19", "-q", "-f", "/tmp/initrd", "-o", "/out/initrd.img"]
             packing.append(lambda: stage.in_tools(*compress))  # on one processor: beside the root
-    shutil.move(stage.target / "boot" / f"vmlinuz-{version}", out / "vmlinuz")
     shutil.rmtree(stage.target / "boot")
     (stage.target / "boot").mkdir()
     with _timed("squashfs"):
@@ -213,6 +216,7 @@ def main(description_file: str) -> None:
 
 
 def _bootstrap(stage: Stage, architecture: str, release: str, packages: list[str]) -> None:
+    """The smallest Debian: what it requires, with apt."""
     include = ",".join(packages)
     stage.shown_in_tools(
         "debootstrap", "--no-check-gpg", "--foreign", "--variant=minbase", f"--arch={architecture}",
@@ -262,26 +266,39 @@ def _remove_excluded(target: Path) -> None:
                 (Path(parent) / name).unlink()
 
 
-def _kernel(stage: Stage, architecture: str, debs: list[str]) -> str:
-    """Unpack the kernel package without its maintainer scripts, whose work (initramfs, links) is done here."""
-    (stage.target / "tmp/kernel").mkdir()
-    names = []
-    for deb in debs:
-        name = Path(deb).name
-        shutil.copy(stage.tools / "repository" / deb, stage.target / "tmp/kernel" / name)
-        names.append(f"/tmp/kernel/{name}")
-    stage.in_target("dpkg", "--unpack", "--force-depends", *names)
+def _prepare_kernel(package: Path, image: Path) -> None:
+    """Write the kernel of a package to `image`, and leave the package without compression."""
+    os.nice(5)  # this thread: debootstrap needs one processor, and takes longer
+    beside = package.with_suffix(".part")
+    deb.without_compression(package, beside)
+    beside.replace(package)  # not into it: it may be a link to the pool's
+    image.write_bytes(debian_kernel.of_package(package))
+
+
+def _install(stage: Stage, repository: Path, packages: list[str]) -> None:
+    """All packages but those that debootstrap has installed, by their paths in the repository, the kernel among them.
+
+    debootstrap would install them, too, but looks each up several times.
+    """
+    place = stage.target / _REPOSITORY.lstrip("/")
+    place.mkdir()
+    mount("--bind", repository, place)
+    no_services = stage.target / "usr/sbin/policy-rc.d"  # for invoke-rc.d: nothing is started here
+    no_services.write_text("#!/bin/sh\nexit 101\n")
+    no_services.chmod(0o755)
+    # As debootstrap unpacks what Debian requires: all at once, whatever depends on what, before any is configured.
+    places = [f"{_REPOSITORY}/{path}" for path in packages]
+    stage.shown_in_target("dpkg", "--unpack", "--force-depends", "--skip-same-version", *places)
     for script in (stage.target / "var/lib/dpkg/info").glob("linux-image-*.*"):
         if script.suffix in (".preinst", ".postinst", ".prerm", ".postrm"):
-            script.unlink()
-    stage.in_target("dpkg", "--configure", "--force-depends", "--pending")
-    shutil.rmtree(stage.target / "tmp/kernel")
+            script.unlink()  # its work, initramfs and links, is done here
+    stage.shown_in_target("dpkg", "--configure", "--pending", "--force-depends")
+    no_services.unlink()
+
+
+def _prune_modules(stage: Stage, architecture: str) -> str:
+    """Leave the modules that robots use; the kernel's version."""
     (version,) = (path.name for path in (stage.target / "lib/modules").iterdir())
-    _prune_modules(stage, architecture, version)
-    return version
-
-
-def _prune_modules(stage: Stage, architecture: str, version: str) -> None:
     directory = stage.target / "lib/modules" / version
     stage.in_tools("depmod", "-b", "/target", version)
     needs = dict(line.split(":", 1) for line in (directory / "modules.dep").read_text().splitlines())
@@ -297,6 +314,7 @@ def _prune_modules(stage: Stage, architecture: str, version: str) -> None:
                 path, content = path.with_suffix(""), lzma.decompress(content)
             path.write_bytes(debian_kernel.without_signature(content))
     stage.in_tools("depmod", "-b", "/target", version)
+    return version
 
 
 def _lay_overlay(target: Path) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from flotilla.common import cache, namespace, paths, progress
+from flotilla.common import cache, namespace, paths, progress, together
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import System
 from images.builder import pool, runtime_stage, toolchain, tools
@@ -159,6 +159,9 @@ def build(system: System) -> Runtime:
     lock = read_lock(runtime_lock(system))
 
     def make(out: Path) -> None:
+        together.at_low_priority(lambda: compile_it(out))  # a root that is made meanwhile needs it last
+
+    def compile_it(out: Path) -> None:
         pool.fill([lock])
         tree = tools.tree(lock)
         for path in sources():

@@ -25,7 +25,6 @@ _PACKAGES = {
 def main(tools: str, out: str, architecture: str, epoch: str, depends: str) -> None:
     """Leave the packages in `out`, which holds the sources in `source/`."""
     os.umask(0o022)
-    os.nice(15)  # a root file system that is made meanwhile waits for it last
     chroot = Chroot(Path(tools), int(epoch))
     chroot.environment |= {"CC": "gcc", "LDFLAGS": "-Wl,--build-id=none", "DESTDIR": "/out/installed"}
     chroot.provide_system(out=out)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import os
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from flotilla.common import cache, namespace, progress
 from flotilla.common.errors import UserError
 from images.builder import pool
-from images.builder.lock import Lock
+from images.builder.lock import Lock, Package
 
 _MERGED = ("bin", "sbin", "lib", "lib32", "lib64")
 _MOUNT_POINTS = ("dev", "proc", "sys", "tmp", "repository", "target", "out", "run")
@@ -28,21 +29,25 @@ def tree(lock: Lock) -> Path:
             for name in _MERGED:
                 (directory / "usr" / name).mkdir(parents=True)
                 (directory / name).symlink_to(f"usr/{name}")
-            for done, package in enumerate(lock.packages):
-                pack = ["dpkg-deb", "--fsys-tarfile", str(pool.file(package))]
-                extract = ["tar", "-x", "--keep-directory-symlink", "--no-same-owner", "-C", str(directory)]
-                extract += ["--exclude=./usr/share/doc", "--exclude=./usr/share/man"]
-                with subprocess.Popen(pack, stdout=subprocess.PIPE) as archive:
-                    unpacked = subprocess.run(extract, stdin=archive.stdout)
-                if archive.returncode != 0 or unpacked.returncode != 0:
-                    raise UserError(f"cannot unpack {package.name} {package.version} ({pool.file(package)})")
-                step.at(done + 1, len(lock.packages), "packages")
+            with ThreadPoolExecutor(os.cpu_count()) as threads:
+                for done, _ in enumerate(threads.map(lambda package: _unpack(package, directory), lock.packages)):
+                    step.at(done + 1, len(lock.packages), "packages")
             for name in _MOUNT_POINTS:
                 (directory / name).mkdir(exist_ok=True)
             # What the maintainer scripts would have set up.
             (directory / "usr/bin/awk").symlink_to("mawk")
 
     return cache.result("tools", cache.digest(lock.digest, Path(__file__)), unpack)
+
+
+def _unpack(package: Package, directory: Path) -> None:
+    pack = ["dpkg-deb", "--fsys-tarfile", str(pool.file(package))]
+    extract = ["tar", "-x", "--keep-directory-symlink", "--no-same-owner", "-C", str(directory)]
+    extract += [f"--exclude=./usr/share/{unused}" for unused in ("doc", "man", "locale")]
+    with subprocess.Popen(pack, stdout=subprocess.PIPE) as archive:
+        unpacked = subprocess.run(extract, stdin=archive.stdout)
+    if archive.returncode != 0 or unpacked.returncode != 0:
+        raise UserError(f"cannot unpack {package.name} {package.version} ({pool.file(package)})")
 
 
 def command(tree: Path, program: str) -> list[str]:

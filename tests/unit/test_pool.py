@@ -281,6 +281,28 @@ def test_repository_says_what_the_archive_said(real: Lock, tmp_path: Path) -> No
         assert (directory / each.path).samefile(pool.file(each))
 
 
+def test_repository_without_compression(real: Lock, tmp_path: Path) -> None:
+    """dpkg-deb finds the same in it; the kernel stays as it is. Seen to fail with the former name, data.tar.xz."""
+    tool, kernel = real.packages[1], Package(**(vars(deb(tmp_path, "image")) | {"role": "kernel"}))
+    directory = tmp_path / "repository"
+    pool.repository(lock_of(tool, kernel), directory, compressed=False)
+    made, packed = directory / tool.path, pool.file(tool)
+
+    def content(package: Path) -> list[bytes]:
+        return [
+            subprocess.run(["dpkg-deb", f"--{part}-tarfile", str(package)], check=True, capture_output=True).stdout
+            for part in ("ctrl", "fsys")
+        ]
+
+    assert content(made) == content(packed)
+    assert content(packed)[1] in made.read_bytes()
+    text = (directory / "dists/bookworm/main/binary-i386/Packages").read_text()
+    found = {stanza["Package"]: stanza for stanza in mirror.stanzas(text)}
+    assert found["tool"]["Size"] == str(made.stat().st_size)
+    assert found["tool"]["SHA256"] == hashlib.sha256(made.read_bytes()).hexdigest()
+    assert (directory / kernel.path).samefile(pool.file(kernel))
+
+
 def test_release_covers_the_index(real: Lock, tmp_path: Path) -> None:
     pool.repository(real, tmp_path / "repository")
     root = tmp_path / "repository/dists/bookworm"

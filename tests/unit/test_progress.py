@@ -289,10 +289,10 @@ def test_a_kernel_by_the_files_that_are_compiled() -> None:
 
 def test_a_root_by_its_packages_and_parts() -> None:
     assert rootfs.far("", 2).done == 0
-    begun = "== debootstrap\nI: Unpacking the base system...\nI: Unpacking a...\nI: Unpacking b:i386...\n"
+    begun = "== packages\nI: Unpacking the base system...\nI: Unpacking a...\nSetting up b:i386 (1:2-3) ...\n"
     half = rootfs.far(begun, 2)
-    assert (half.done, half.part) == (40, "debootstrap")
-    later = rootfs.far(begun + "== debootstrap: 80.0 s\n== kernel\n", 2)
+    assert (half.done, half.part) == (40, "packages")
+    later = rootfs.far(begun + "== packages: 80.0 s\n== kernel\n", 2)
     assert (later.done, later.part) == (80, "kernel")
 
 
@@ -306,7 +306,7 @@ def test_what_debootstrap_says_is_in_the_log_at_once(tmp_path: Path) -> None:
 def test_the_stages_parts_are_those_that_are_weighed() -> None:
     """A new part has to say how long it takes."""
     source = Path(rootfs.__file__).read_text()
-    assert ["debootstrap", *re.findall(r'_timed\("(\w+)"\)', source)] == list(rootfs._SECONDS)
+    assert ["packages", *re.findall(r'_timed\("(\w+)"\)', source)] == list(rootfs._SECONDS)
 
 
 def test_the_runtime_by_what_ninja_counts() -> None:
