@@ -149,7 +149,7 @@ def second(described: Fleet) -> Host:
     return Host(name=SECOND, address=described.network.subnet.broadcast_address - 3)
 
 
-def _rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
+def rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
     """Files of each robot by its name and their path; keys are made in `keys`."""
     with mock.patch.object(paths, "KEYS", keys):
         computable_keys.write()
@@ -228,7 +228,7 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
     directory = DIRECTORY / plan.name
     described = fleet(plan.transport, plan.standby, second_station=plan.second_station, board=board)
     flying = described.robot_with("valves")
-    brought = _rendered(described, keys)
+    brought = rendered(described, keys)
     there = {
         f"{directory}/plant.yml": plant(plan, described, board),
         f"{directory}/station.yml": station(described),
@@ -305,7 +305,7 @@ def session(
     }
     return {
         f"{DIRECTORY}/fly.py": (HERE / "fly.py").read_bytes(),
-        cell: _rendered(described, keys)[described.robot_with("valves").name]["/etc/flotilla/ibss.conf"],
+        cell: rendered(described, keys)[described.robot_with("valves").name]["/etc/flotilla/ibss.conf"],
         f"{DIRECTORY}/session.json": json.dumps(document, sort_keys=True).encode(),
     }
 
