@@ -38,11 +38,11 @@ def whole_ns() -> int:
 
 
 @contextmanager
-def running(task: dict[str, Any]) -> Iterator[subprocess.Popen[bytes]]:
+def running(task: dict[str, Any], *options: str) -> Iterator[subprocess.Popen[bytes]]:
     directory = task["directory"]
     environment = os.environ | {"CREDENTIALS_DIRECTORY": directory, "CYCLONEDDS_URI": task["cyclonedds"]}
     argv = ["ip", "netns", "exec", task["computer"], "flotilla-run", "--control", control(task)]
-    argv += [f"{directory}/{task['name']}.yml"]
+    argv += [*options, f"{directory}/{task['name']}.yml"]
     with (
         (Path(directory) / "log").open("wb") as log,
         subprocess.Popen(argv, env=environment, stdout=log, stderr=log) as process,
@@ -57,13 +57,19 @@ def control(task: dict[str, Any]) -> str:
     return f"{task['directory']}/control"
 
 
-def taken(task: dict[str, Any]) -> int:
-    """Messages so far."""
-    argv = ["flotilla-scope", "--control", control(task), "--rows", "1", task["name"], "in.sequence"]
+def outputs(task: dict[str, Any], *names: str) -> dict[str, int]:
+    """As they are now."""
+    argv = ["flotilla-scope", "--control", control(task), "--rows", "1", task["name"], *names]
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{done.stderr}{(Path(task['directory']) / 'log').read_text()}")
-    return int(json.loads(done.stdout.splitlines()[-1])["in.sequence"])
+    row = json.loads(done.stdout.splitlines()[-1])
+    return {name: int(row[name]) for name in names}
+
+
+def taken(task: dict[str, Any]) -> int:
+    """Messages so far."""
+    return outputs(task, "in.sequence")["in.sequence"]
 
 
 def exchange(described: dict[str, Any]) -> dict[str, int]:
@@ -87,12 +93,17 @@ def exchange(described: dict[str, Any]) -> dict[str, int]:
     return {"sender_ns": sender, "receiver_ns": receiver, "whole_ns": whole, "taken": came, "periods": periods}
 
 
-def main() -> dict[str, Any]:
+def join() -> None:
+    """The computers of the session, as namespaces with a radio each, are in the cell."""
     session = json.loads(Path("session.json").read_text())
     for link, target in session["links"].items():
         Path(link).unlink(missing_ok=True)
         Path(link).symlink_to(target)
     fly.join_cell(session["computers"])
+
+
+def main() -> dict[str, Any]:
+    join()
     return {each["name"]: exchange(each) for each in json.loads(Path("exchanges.json").read_text())}
 
 

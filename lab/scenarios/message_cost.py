@@ -80,8 +80,8 @@ def measure(board: Board, out: Path) -> dict[str, Cost]:
     there |= {f"{DIRECTORY}/lab/scenarios/{name}": (virtual.HERE / name).read_bytes() for name in _PROGRAMS}
     exchanges = []
     for name, variant in VARIANTS.items():
-        exchange, files = _exchange(name, variant, board, out / "keys")
-        exchanges.append(exchange)
+        found, files = exchange(name, variant, board, out / "keys")
+        exchanges.append(found)
         there |= files
     there[f"{DIRECTORY}/exchanges.json"] = json.dumps(exchanges).encode()
     measured = subject.build(board)
@@ -95,7 +95,7 @@ def measure(board: Board, out: Path) -> dict[str, Cost]:
     return {name: _cost(said[name], said["none"]) for name in VARIANTS if name != "none"}
 
 
-def _exchange(name: str, variant: Variant, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+def exchange(name: str, variant: Variant, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """As exchange.py reads it, and its files by path."""
     described = virtual.fleet(variant.transport or "udp", dds_security=variant.transport == "dds", board=board)
     rendered = virtual.rendered(described, keys)
@@ -121,6 +121,13 @@ def _exchange(name: str, variant: Variant, board: Board, keys: Path) -> tuple[di
             {"computer": robot.name, "name": task, "directory": directory, "cyclonedds": ",".join(configuration)}
         )
     return {"name": name, "tasks": tasks, "messages": bool(variant.transport)}, files
+
+
+def received(described: Fleet, keys: Path) -> dict[str, Any]:
+    """Parameters of the block that takes the message."""
+    block = _block(described, virtual.rendered(described, keys), "thruster-mapping", "wrench", VARIANTS["udp-keys"])
+    found: dict[str, Any] = block["parameters"]
+    return found
 
 
 def _block(
