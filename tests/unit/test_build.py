@@ -13,7 +13,7 @@ import pytest
 from flotilla.common import namespace, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet, System
-from images.builder import build, debian_kernel, pool, rootfs, runtime, tools
+from images.builder import build, pool, rootfs, runtime, tools
 from images.builder.lock import read_lock
 
 PC104 = System("i386", "bookworm")
@@ -79,9 +79,8 @@ def test_the_root_is_begun_before_the_runtime_is_compiled(
 
     monkeypatch.setattr(runtime, "build", compile_runtime)
     monkeypatch.setattr(tools, "tree", lambda _: own_build / "tools")
-    monkeypatch.setattr(pool, "repository", lambda *_: None)
+    monkeypatch.setattr(pool, "repository", lambda *_, compressed: None)
     monkeypatch.setattr(namespace, "run_stage", stage)
-    monkeypatch.setattr(debian_kernel, "repacked", lambda content: content)
     locks = read_lock("smartcoret3"), read_lock("tools")
     if wrong:
         with pytest.raises(UserError, match=r"^a.c:1: error$"):
