@@ -177,7 +177,7 @@ def main(description_file: str) -> None:
             lambda: _prepare_kernel(repository / description["kernel"], out / "vmlinuz"),
             lambda: _bootstrap(stage, description["architecture"], description["release"], description["required"]),
         )
-        _install(stage, repository, [*description["others"], description["kernel"]])
+        _install(stage, repository, description["others"], description["kernel"])
     stage.in_target("perl", "-MPOSIX=strftime", "-e", 'print strftime("clock of the target: %F\\n", gmtime)')
     with _timed("kernel"):
         version = _prune_modules(stage, description["architecture"])
@@ -275,8 +275,8 @@ def _prepare_kernel(package: Path, image: Path) -> None:
     image.write_bytes(debian_kernel.of_package(package))
 
 
-def _install(stage: Stage, repository: Path, packages: list[str]) -> None:
-    """All packages but those that debootstrap has installed, by their paths in the repository, the kernel among them.
+def _install(stage: Stage, repository: Path, packages: list[str], kernel_package: str) -> None:
+    """All packages but those that debootstrap has installed, by their paths in the repository.
 
     debootstrap would install them, too, but looks each up several times.
     """
@@ -289,9 +289,12 @@ def _install(stage: Stage, repository: Path, packages: list[str]) -> None:
     # As debootstrap unpacks what Debian requires: all at once, whatever depends on what, before any is configured.
     places = [f"{_REPOSITORY}/{path}" for path in packages]
     stage.shown_in_target("dpkg", "--unpack", "--force-depends", "--skip-same-version", *places)
+    stage.shown_in_target("dpkg", "--configure", "--pending")
+    # The kernel depends on programs for its scripts, whose work, initramfs and links, is done here.
+    stage.shown_in_target("dpkg", "--unpack", "--force-depends", f"{_REPOSITORY}/{kernel_package}")
     for script in (stage.target / "var/lib/dpkg/info").glob("linux-image-*.*"):
         if script.suffix in (".preinst", ".postinst", ".prerm", ".postrm"):
-            script.unlink()  # its work, initramfs and links, is done here
+            script.unlink()
     stage.shown_in_target("dpkg", "--configure", "--pending", "--force-depends")
     no_services.unlink()
 
