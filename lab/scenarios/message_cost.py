@@ -8,6 +8,7 @@ to the byte.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,8 @@ from lab.scenarios import virtual
 from lab.scenarios.virtual import DIRECTORY
 
 PERIOD_NS = 10_000_000
-_PROGRAMS = ("fly.py", "exchange.py")
-_LIMIT_S = 900
+_PROGRAMS = ("fly.py", "exchange.py", "flooded.py")
+_LIMIT_S = 1800
 """Of the host's clock."""
 _MESSAGE = {
     "clock": {"type": "clock"},
@@ -77,22 +78,27 @@ def measure(board: Board, out: Path) -> dict[str, Cost]:
     described = virtual.fleet("dds", dds_security=True, board=board)
     sender, receiver = described.robot_with("control"), described.robot_with("thruster-mapping")
     there = virtual.session(described, [sender, receiver], [], out / "keys", {}, [])
-    there |= {f"{DIRECTORY}/lab/scenarios/{name}": (virtual.HERE / name).read_bytes() for name in _PROGRAMS}
     exchanges = []
     for name, variant in VARIANTS.items():
         found, files = exchange(name, variant, board, out / "keys")
         exchanges.append(found)
         there |= files
     there[f"{DIRECTORY}/exchanges.json"] = json.dumps(exchanges).encode()
+    said: dict[str, dict[str, int]] = run(board, there, out, "exchange")
+    return {name: _cost(said[name], said["none"]) for name in VARIANTS if name != "none"}
+
+
+def run(board: Board, there: Mapping[str, bytes], out: Path, program: str, extra: tuple[str, ...] = ()) -> Any:
+    """What a program of this folder says in a guest. `there`: files that it finds; `extra`: QEMU's arguments."""
+    programs = {f"{DIRECTORY}/lab/scenarios/{name}": (virtual.HERE / name).read_bytes() for name in _PROGRAMS}
     measured = subject.build(board)
-    commands = {"session": ["env", "-C", str(DIRECTORY), "python3", "-m", "lab.scenarios.exchange"]}
+    commands = {"session": ["env", "-C", str(DIRECTORY), "python3", "-m", f"lab.scenarios.{program}"]}
     initrd = out / "initrd.img"
-    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, there)
-    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments())
+    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, {**there, **programs})
+    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=extra)
     document = results.received(guest.run(out, _LIMIT_S))
     initrd.unlink()
-    said: dict[str, dict[str, int]] = json.loads(document["commands"]["session"])
-    return {name: _cost(said[name], said["none"]) for name in VARIANTS if name != "none"}
+    return json.loads(document["commands"]["session"])
 
 
 def exchange(name: str, variant: Variant, board: Board, keys: Path) -> tuple[dict[str, Any], dict[str, bytes]]:

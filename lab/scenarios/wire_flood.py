@@ -2,7 +2,7 @@
 
 As for `message_cost`, two computers are namespaces of one guest. The receiver has an Ethernet adapter, too, from which
 datagrams come as from the sender: right in address, port and length, wrong in their proof. They come from outside the
-guest (lab/latency/wire.c), so that the rate does not depend on what the guest does.
+guest (wire.c), so that the rate does not depend on what the guest does.
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ from pathlib import Path
 from flotilla.fleet.model import Board
 from images.builder import runtime
 from images.builder.lock import HOST
-from lab.latency import machine, results, subject
 from lab.scenarios import message_cost, virtual
 from lab.scenarios.virtual import DIRECTORY
 
-_PLUGIN = Path(machine.__file__).with_name("wire.c")
-_PROGRAMS = ("fly.py", "exchange.py", "flooded.py")
+_PLUGIN = "wire.c"
 _ADAPTER = "52:54:00:f1:00:02"
 _FRAMES = 64
 _PROOF_BYTES = 40
@@ -35,8 +33,6 @@ blocks:
   filtered: {type: low-pass, in: {in: clock.time}, parameters: {time_constant: 1}}
 """
 """A task that no message comes to."""
-_LIMIT_S = 1800
-"""Of the host's clock."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,6 @@ def measure(board: Board, out: Path, rate_hz: int) -> dict[str, Flooded]:
     sender, receiver = described.robot_with("control"), described.robot_with("thruster-mapping")
     exchange, there = message_cost.exchange("flood", message_cost.VARIANTS["udp-keys"], board, out / "keys")
     there |= virtual.session(described, [sender, receiver], [], out / "keys", {}, [])
-    there |= {f"{DIRECTORY}/lab/scenarios/{name}": (virtual.HERE / name).read_bytes() for name in _PROGRAMS}
     there[f"{DIRECTORY}/nftables.conf"] = virtual.rendered(described, out / "keys")[receiver.name]["/etc/nftables.conf"]
     alone = exchange["tasks"][1] | {"name": "alone"}
     exchange["tasks"].append(alone | {"directory": f"{alone['directory']}-alone"})
@@ -95,18 +90,11 @@ def measure(board: Board, out: Path, rate_hz: int) -> dict[str, Flooded]:
         frames(str(sender.address), str(receiver.address), int(block["port"]), int(block["length"]) + _PROOF_BYTES)
     )
     options = ["-std=gnu11", *runtime.WARNINGS, "-fvisibility=hidden"]
-    (out / "wire.so").write_bytes(runtime.compile_shared(_PLUGIN.parent, (_PLUGIN.name,), HOST, options))
-    measured = subject.build(board)
-    commands = {"session": ["env", "-C", str(DIRECTORY), "python3", "-m", "lab.scenarios.flooded"]}
-    initrd = out / "initrd.img"
-    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, there)
+    (out / "wire.so").write_bytes(runtime.compile_shared(virtual.HERE, (_PLUGIN,), HOST, options))
     file, plugin = (str(out / name).replace(",", ",,") for name in ("frames", "wire.so"))
     extra = (
         "-netdev", "hubport,id=wire,hubid=0", "-device", f"{board.qemu.network},netdev=wire,mac={_ADAPTER},romfile=",
         "-plugin", f"{plugin},netdev=wire,frames={file},interval_ns={1_000_000_000 // rate_hz}",
     )  # fmt: skip
-    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=extra)
-    document = results.received(guest.run(out, _LIMIT_S))
-    initrd.unlink()
-    said = json.loads(document["commands"]["session"])
+    said = message_cost.run(board, there, out, "flooded", extra)
     return {name: Flooded(**found) for name, found in said.items()}

@@ -20,10 +20,10 @@ HARMLESS = {
     r"ACPI: setting ELCR to [0-9a-f]{4} \(from [0-9a-f]{4}\)": "by acpi=noirq: ACPI's own interrupt becomes a level",
     r"tsc: Unable to calibrate against PIT": "QEMU's timers on a busy host",
     r"MP-BIOS bug: 8254 timer not connected to IO-APIC": "QEMU's timers on a busy host",
-    r"tsc: PIT calibration deviates from PMTIMER": "QEMU's timers on a busy host",
+    r"tsc: PIT calibration deviates from (PMTIMER|HPET)": "QEMU's timers on a busy host",
     r"clocksource: Long readout interval, skipping watchdog check": "QEMU's timers on a busy host",
     r"tsc: Fast TSC calibration failed": "QEMU's timers on a busy host",
-    r"clocksource: .*'(tsc|tsc-early|refined-jiffies|acpi_pm)'": "QEMU's timers on a busy host",
+    r"clocksource: .*'(tsc|tsc-early|refined-jiffies|acpi_pm|hpet)'": "QEMU's timers on a busy host",
     r"TSC found unstable after boot": "QEMU's timers on a busy host",
     r"Unstable clock detected, switching default tracing clock": "QEMU's timers on a busy host",
     r"^ *(If you want to keep using the local clock, then add:|\"trace_clock=local\"|on the kernel command line)$": (
