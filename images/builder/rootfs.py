@@ -283,6 +283,7 @@ def _install(stage: Stage, repository: Path, packages: list[str], kernel_package
     place = stage.target / _REPOSITORY.lstrip("/")
     place.mkdir()
     mount("--bind", repository, place)
+    mount("-t", "proc", "proc", stage.target / "proc")  # debootstrap has taken its own away
     no_services = stage.target / "usr/sbin/policy-rc.d"  # for invoke-rc.d: nothing is started here
     no_services.write_text("#!/bin/sh\nexit 101\n")
     no_services.chmod(0o755)
