@@ -17,6 +17,8 @@ CONDUCTOR = (_CHANNEL, "conductor.c")
 """Of their host."""
 BARRIER = ("barrier.c",)
 """Of QEMU."""
+WIRE = ("wire.c",)
+"""Of QEMU: who sends from a guest's cable."""
 MAILBOX_BYTES = 1 << 20
 """As lockstep.h has it."""
 

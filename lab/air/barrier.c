@@ -15,23 +15,9 @@
 #include <unistd.h>
 
 #include "lockstep.h"
+#include "plugin.h"
 
-typedef uint64_t qemu_plugin_id_t;
-struct qemu_info;
-EXPORT int qemu_plugin_version = 1;
-EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const struct qemu_info *info, int count, char **arguments);
-struct qemu_plugin_tb;
-void qemu_plugin_register_vcpu_tb_trans_cb(qemu_plugin_id_t id,
-                                           void (*translated)(qemu_plugin_id_t id, struct qemu_plugin_tb *block));
-
-enum { QEMU_CLOCK_VIRTUAL = 1, SCALE_NS = 1 };
-struct timer {
-    int64_t members[8]; /* QEMUTimer has 48 bytes */
-};
 struct chardev;
-void timer_init_full(struct timer *timer, void *default_lists, int clock, int scale, int attributes,
-                     void (*ends)(void *data), void *data);
-void timer_mod_ns(struct timer *timer, int64_t at_ns);
 struct chardev *qemu_chr_find(const char *name);
 int qemu_chr_be_can_write(struct chardev *chardev);
 void qemu_chr_be_write(struct chardev *chardev, const uint8_t *bytes, int count);
@@ -66,16 +52,6 @@ static void translated(qemu_plugin_id_t id, struct qemu_plugin_tb *block)
     begun = true;
     timer_init_full(&quantum, NULL, QEMU_CLOCK_VIRTUAL, SCALE_NS, 0, quantum_ends, NULL);
     timer_mod_ns(&quantum, LONG_QUANTUM_NS);
-}
-
-/* The value of an argument `name=value`; "" where there is none. */
-static const char *argument(const char *name, int count, char **arguments)
-{
-    size_t length = strlen(name);
-    for (int i = 0; i < count; i++)
-        if (!strncmp(arguments[i], name, length) && arguments[i][length] == '=')
-            return arguments[i] + length + 1;
-    return "";
 }
 
 int qemu_plugin_install(qemu_plugin_id_t id, const struct qemu_info *info, int count, char **arguments)

@@ -111,10 +111,10 @@ def exchange(name: str, variant: Variant, board: Board, keys: Path) -> tuple[dic
         sends["out"] = _block(described, rendered, "control", "to_mapping", variant) | {"in": {"data": "message.out"}}
         takes["in"] = _block(described, rendered, "thruster-mapping", "wrench", variant)
     files, tasks = {}, []
-    for task, blocks, priority in (("control", sends, 80), ("thruster-mapping", takes, 80)):
+    for task, blocks in (("control", sends), ("thruster-mapping", takes)):
         robot = described.robot_with(task)
         directory = f"{DIRECTORY}/{name}/{task}"
-        content: dict[str, Any] = {"period": "10 ms", "priority": priority, "overruns": 0, "blocks": blocks}
+        content: dict[str, Any] = {"period": "10 ms", "priority": 80, "overruns": 0, "blocks": blocks}
         if task == "thruster-mapping" and variant.transport:
             content["trigger"] = "in"
         files[f"{directory}/{task}.yml"] = yaml.safe_dump(content).encode()

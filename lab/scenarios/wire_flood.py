@@ -2,7 +2,7 @@
 
 As for `message_cost`, two computers are namespaces of one guest. The receiver has an Ethernet adapter, too, from which
 datagrams come as from the sender: right in address, port and length, wrong in their proof. They come from outside the
-guest (wire.c), so that the rate does not depend on what the guest does.
+guest (lab/air/wire.c), so that the rate does not depend on what the guest does.
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flotilla.fleet.model import Board
-from images.builder import runtime
 from images.builder.lock import HOST
+from lab import air
 from lab.scenarios import message_cost, virtual
 from lab.scenarios.virtual import DIRECTORY
 
-_PLUGIN = "wire.c"
 _ADAPTER = "52:54:00:f1:00:02"
 _FRAMES = 64
 _PROOF_BYTES = 40
@@ -56,7 +55,7 @@ class Flooded:
 
 
 def frames(source: str, target: str, port: int, bytes_: int) -> bytes:
-    """Forged datagrams as wire.c reads them."""
+    """Forged datagrams as lab/air/wire.c reads them."""
     made = b""
     for number in range(_FRAMES):
         payload = random.Random(number).randbytes(bytes_)
@@ -89,8 +88,7 @@ def measure(board: Board, out: Path, rate_hz: int) -> dict[str, Flooded]:
     (out / "frames").write_bytes(
         frames(str(sender.address), str(receiver.address), int(block["port"]), int(block["length"]) + _PROOF_BYTES)
     )
-    options = ["-std=gnu11", *runtime.WARNINGS, "-fvisibility=hidden"]
-    (out / "wire.so").write_bytes(runtime.compile_shared(virtual.HERE, (_PLUGIN,), HOST, options))
+    (out / "wire.so").write_bytes(air.compiled(air.WIRE, HOST))
     file, plugin = (str(out / name).replace(",", ",,") for name in ("frames", "wire.so"))
     extra = (
         "-netdev", "hubport,id=wire,hubid=0", "-device", f"{board.qemu.network},netdev=wire,mac={_ADAPTER},romfile=",

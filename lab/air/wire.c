@@ -6,31 +6,16 @@
  * lost, as all is while it is down.
  *
  * Timers and cables are QEMU's own, which its program exports for its modules (include/qemu/timer.h,
- * include/net/net.h), those of QEMU 7.2, which is locked; lab/air/barrier.c says why it begins as it does. */
+ * include/net/net.h), those of QEMU 7.2, which is locked; barrier.c says why it begins as it does. */
 #include <stdbool.h>
-#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-#define EXPORT __attribute__((visibility("default")))
+#include "plugin.h"
 
-typedef uint64_t qemu_plugin_id_t;
-struct qemu_info;
-EXPORT int qemu_plugin_version = 1;
-EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const struct qemu_info *info, int count, char **arguments);
-struct qemu_plugin_tb;
-void qemu_plugin_register_vcpu_tb_trans_cb(qemu_plugin_id_t id,
-                                           void (*translated)(qemu_plugin_id_t id, struct qemu_plugin_tb *block));
-
-enum { QEMU_CLOCK_VIRTUAL = 1, SCALE_NS = 1, BYTES = 1 << 20 };
-struct timer {
-    int64_t members[8]; /* QEMUTimer has 48 bytes */
-};
+enum { BYTES = 1 << 20 };
 struct cable;
-void timer_init_full(struct timer *timer, void *default_lists, int clock, int scale, int attributes,
-                     void (*ends)(void *data), void *data);
-void timer_mod_ns(struct timer *timer, int64_t at_ns);
 struct cable *qemu_find_netdev(const char *name);
 int qemu_can_send_packet(struct cable *cable);
 long qemu_send_packet(struct cable *cable, const uint8_t *frame, int bytes);
@@ -64,16 +49,6 @@ static void translated(qemu_plugin_id_t id, struct qemu_plugin_tb *block)
     at_ns = interval_ns;
     timer_init_full(&pause, NULL, QEMU_CLOCK_VIRTUAL, SCALE_NS, 0, send_one, NULL);
     timer_mod_ns(&pause, at_ns);
-}
-
-/* The value of an argument `name=value`; "" where there is none. */
-static const char *argument(const char *name, int count, char **arguments)
-{
-    size_t length = strlen(name);
-    for (int i = 0; i < count; i++)
-        if (!strncmp(arguments[i], name, length) && arguments[i][length] == '=')
-            return arguments[i] + length + 1;
-    return "";
 }
 
 int qemu_plugin_install(qemu_plugin_id_t id, const struct qemu_info *info, int count, char **arguments)
