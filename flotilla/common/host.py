@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,6 +29,8 @@ _SPACE = 1 << 30
 """Bytes of disk for the pool, one board's results and an image."""
 _FULL = 16 << 20
 """Bytes below which a disk counts as full: files are larger than this."""
+_was_full = threading.Event()
+"""Once a failure found the disk full: what it removes then makes room, and work at the same time fails all the same."""
 _MEMORY = 1 << 30
 """Bytes of memory for the root file system while it is made."""
 
@@ -74,15 +77,23 @@ def _missing_memory(meminfo: Path = Path("/proc/meminfo")) -> list[str]:
     ]
 
 
+class _FullDisk(UserError):
+    """A failure that was explained."""
+
+
 @contextlib.contextmanager
 def explaining_a_full_disk() -> Iterator[None]:
     """Whatever way a full disk made a step fail, say that it was the disk."""
     try:
         yield
+    except _FullDisk:
+        raise
     except (UserError, OSError) as error:
-        if shutil.disk_usage(paths.BUILD).free > _FULL:
+        if shutil.disk_usage(paths.BUILD).free <= _FULL:
+            _was_full.set()
+        if not _was_full.is_set():
             raise
-        raise UserError(
+        raise _FullDisk(
             f"{paths.shown(paths.BUILD)}: no space left on its disk, so the build failed; the last good images are "
             f"untouched; make room, or choose another place with BUILD=directory ({str(error).splitlines()[0]})"
         ) from error

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 import time
+from collections import namedtuple
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from flotilla.common import cache, paths, progress
+from flotilla.common import cache, host, paths, progress
+from flotilla.common.errors import UserError
 
 PATIENCE_S = 60
 
@@ -42,6 +46,38 @@ def test_a_failed_step_leaves_nothing_that_could_be_taken_for_a_result(capsys: p
         cache.result("kind", "0123456789abcdef", fail)
     assert list(paths.CACHE.glob("[!.]*")) == []
     assert "kind-0123456789abcdef.part, which is not complete: 0." in capsys.readouterr().err
+
+
+def test_work_that_a_full_disk_made_fail_says_so_when_other_work_has_made_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a compiler that is unpacked beside a root file system. With `free` asked at the end alone, this failed."""
+    free, usage = [0], namedtuple("usage", "free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(free[0]))
+    monkeypatch.setattr(host, "_was_full", threading.Event())
+    removed = threading.Event()
+
+    def fail(_: Path) -> None:
+        raise UserError("tar failed")
+
+    def unpack() -> None:
+        try:
+            cache.result("tools", "0" * 64, fail)
+        finally:
+            free[0] = 1 << 30
+            removed.set()
+
+    def install() -> None:
+        assert removed.wait(10)
+        raise UserError("debootstrap failed")
+
+    with pytest.raises(UserError, match=r"no space left on its disk.*BUILD=directory \(debootstrap failed\)"):
+        cache.result("rootfs", "1" * 64, lambda _: _both(unpack, install))
+
+
+def _both(unpack: Callable[[], None], install: Callable[[], None]) -> None:
+    """Whichever ended first, the failure of `install` is raised."""
+    with ThreadPoolExecutor(2) as threads:
+        threads.submit(unpack)
+        threads.submit(install).result()
 
 
 def test_what_a_killed_build_left_is_removed_by_the_next() -> None:
