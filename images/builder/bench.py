@@ -27,11 +27,24 @@ from images.builder.lock import Lock, read_lock
 _PACKAGES = paths.PROJECT / "images" / "bench-packages.txt"
 _RUNS = 5
 """Of what takes about a second; the median counts."""
+_COLD_RUNS = 3
+"""Of a cold build and of mkosi's, in turn: a computer's speed differs by a fifth between one minute and the next."""
 _MANY = 100
 """Robots that are made at once."""
-_INITRAMFS = "initrd.img"
-"""Of the robot that is built first."""
 REPORT = paths.BUILD / "reports" / "bench.json"
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is measured."""
+
+    name: str
+    made: str
+    """What it produces."""
+    make: Callable[[], int]
+    """Does it, in processes of its own; the bytes that it produced."""
+    prepare: Callable[[], None] = lambda: None
+    """Is done before each run, and is not measured."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +79,14 @@ def bench(fleet: Fleet, first: Robot) -> str:
     cache.discard(work)
     load = os.getloadavg()[0]
     try:
-        rows = _ours(work, fleet, first, others)
-        repository = work / "repository"
+        ours, repository = work / "ours", work / "repository"
         pool.repository(lock, repository)
-        rows.append(_mmdebstrap(work, repository, lock))
+        cold = [_cold(ours, first)]
         if mkosi:
-            rows.append(_mkosi(mkosi, work / "mkosi", repository, lock, work / _INITRAMFS))
+            bench_mkosi.tools(work / "mkosi-tools")
+            cold.append(_mkosi(mkosi, work, repository, lock, ours / "cache"))
+        rows = [*_in_turn(cold, _COLD_RUNS if mkosi else 1), *_warm(ours, fleet, first, others)]
+        rows.append(_measure(_mmdebstrap(work, repository, lock), 1))
     finally:
         cache.discard(work)
     REPORT.parent.mkdir(parents=True, exist_ok=True)
@@ -86,34 +101,44 @@ def bench(fleet: Fleet, first: Robot) -> str:
     return "\n".join(lines if mkosi else [*lines, bench_mkosi.MISSING])
 
 
-def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[Row]:
-    """Our own builds in `work`, from an empty cache on, and the copy of an image."""
-    work.mkdir(parents=True)
-    (work / "pool").symlink_to(paths.POOL)
+def _image(work: Path, *robots: Robot) -> Callable[[], int]:
+    """Makes the images of a robot, or of the whole fleet, in the build directory `work`."""
     images = work / "images"
 
-    def image(*robots: Robot) -> Callable[[], int]:
-        def make() -> int:
-            choice = ["--all"] if len(robots) == len(fleet.robots) else [str(robots[0].number)]
-            _command([sys.executable, "-m", "flotilla", "image", *choice], BUILD=str(work), KEYS=str(paths.KEYS))
-            return sum(_allocated(images / build.image_of(robot).name) for robot in robots)
+    def make() -> int:
+        choice = [str(robots[0].number)] if len(robots) == 1 else ["--all"]
+        _command([sys.executable, "-m", "flotilla", "image", *choice], BUILD=str(work), KEYS=str(paths.KEYS))
+        return sum(_allocated(images / build.image_of(robot).name) for robot in robots)
 
-        return make
+    return make
 
-    rows = [
-        _measure(f"cold build of {first.name}: empty cache, packages in the pool", "bootable card", image(first), 1)
-    ]
-    for made in (work / "cache").glob(f"rootfs-*/{_INITRAMFS}"):  # one root so far
-        shutil.copyfile(made, work / _INITRAMFS)
+
+def _cold(work: Path, first: Robot) -> Work:
+    """The image of a robot from an empty cache on."""
+
+    def prepare() -> None:
+        cache.discard(work)
+        work.mkdir(parents=True)
+        (work / "pool").symlink_to(paths.POOL)
+
+    name = f"cold build of {first.name}: empty cache, packages in the pool"
+    return Work(name, "bootable card", _image(work, first), prepare)
+
+
+def _warm(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[Row]:
+    """Our own builds in `work` after a cold one, and the copy of an image."""
+    images, rows = work / "images", []
     if others:
         title = f"{others[0].name} after {first.name}"
-        rows.append(_measure(title, "bootable card", image(others[0]), _RUNS))
-    rows.append(_measure(f"{_MANY} more robots of that board", f"{_MANY} bootable cards", _many(work, first), 1))
+        rows.append(_measure(Work(title, "bootable card", _image(work, others[0])), _RUNS))
+    many = Work(f"{_MANY} more robots of that board", f"{_MANY} bootable cards", _many(work, first))
+    rows.append(_measure(many, 1))
     everyone = list(fleet.robots.values())
     boards = len({robot.board for robot in everyone})
     cards = f"{len(everyone)} bootable cards"
-    rows.append(_measure(f"whole fleet after that: {boards - 1} more boards, cold", cards, image(*everyone), 1))
-    rows.append(_measure("whole fleet again", cards, image(*everyone), _RUNS))
+    whole = _image(work, *everyone)
+    rows.append(_measure(Work(f"whole fleet after that: {boards - 1} more boards, cold", cards, whole), 1))
+    rows.append(_measure(Work("whole fleet again", cards, whole), _RUNS))
 
     def copy() -> int:
         source, target = images / build.image_of(first).name, work / "copy.img"
@@ -121,7 +146,7 @@ def _ours(work: Path, fleet: Fleet, first: Robot, others: list[Robot]) -> list[R
         _command(["cp", "--reflink=never", str(source), str(target)])
         return _allocated(target)
 
-    rows.append(_measure("cp of an image, its pages in memory", "the same bytes", copy, _RUNS))
+    rows.append(_measure(Work("cp of an image, its pages in memory", "the same bytes", copy), _RUNS))
     return rows
 
 
@@ -149,7 +174,7 @@ def _many(work: Path, first: Robot) -> Callable[[], int]:
     return make
 
 
-def _mmdebstrap(work: Path, repository: Path, lock: Lock) -> Row:
+def _mmdebstrap(work: Path, repository: Path, lock: Lock) -> Work:
     """The same packages from the same files, but for the kernel."""
     out = work / "root.tar.zst"
     names = ",".join(_userland(lock))
@@ -165,22 +190,26 @@ def _mmdebstrap(work: Path, repository: Path, lock: Lock) -> Row:
         _command(argv, SOURCE_DATE_EPOCH=str(lock.epoch))
         return out.stat().st_size
 
-    return _measure("mmdebstrap, same packages without the kernel", "tar.zst, not bootable", make, 1)
+    return Work("mmdebstrap, same packages without the kernel", "tar.zst, not bootable", make)
 
 
-def _mkosi(program: str, directory: Path, repository: Path, lock: Lock, initramfs: Path) -> Row:
-    """The same packages, with the kernel, as a disk that starts."""
-    grub = tools.tree(read_lock("tools")) / "usr/lib/grub/i386-pc"
-    bench_mkosi.prepare(directory, lock, grub, initramfs)
-    bench_mkosi.tools(directory / "tools")
-    argv = bench_mkosi.command(program, directory, repository, lock)
+def _mkosi(program: str, work: Path, repository: Path, lock: Lock, made: Path) -> Work:
+    """The same packages, with the kernel, as a disk that starts; `made` is the cache of a cold build of ours."""
+    directory = work / "mkosi"
+    argv = bench_mkosi.command(program, directory, work / "mkosi-tools", repository, lock)
+
+    def prepare() -> None:
+        cache.discard(directory)
+        grub = tools.tree(read_lock("tools")) / "usr/lib/grub/i386-pc"
+        (initramfs,) = made.glob("rootfs-*/initrd.img")
+        bench_mkosi.prepare(directory, lock, grub, initramfs)
 
     def make() -> int:
         _command(argv)
         return _allocated(directory / "disk.raw")
 
-    made = "bootable disk without runtime, overlay and identity; its initramfs was given"
-    return _measure("mkosi, same packages with the kernel", made, make, 1)
+    what = "bootable disk without runtime, overlay and identity; its initramfs was given"
+    return Work("mkosi, same packages with the kernel", what, make, prepare)
 
 
 def _userland(lock: Lock) -> list[str]:
@@ -201,17 +230,37 @@ def _allocated(path: Path) -> int:
     return path.stat().st_blocks * 512
 
 
-def _measure(work: str, made: str, make: Callable[[], int], runs: int) -> Row:
-    seconds, processor = [], []
-    size = 0
-    with progress.step(work) as step:
+def _in_turn(works: list[Work], runs: int) -> list[Row]:
+    """One run of each after the other, `runs` times: whatever slows the computer for minutes slows them alike."""
+    measured: list[list[tuple[float, float, int]]] = []
+    with progress.step(", ".join(work.name for work in works)) as step:
         for run in range(runs):
             step.at(run, runs, "runs")
-            started, used = time.monotonic(), _processor()
-            size = make()
-            seconds.append(time.monotonic() - started)
-            processor.append(_processor() - used)
-    return Row(work, made, statistics.median(seconds), statistics.median(processor), size, runs)
+            measured.append([_run(work) for work in works])
+    return [_row(work, list(column)) for work, column in zip(works, zip(*measured, strict=True), strict=True)]
+
+
+def _measure(work: Work, runs: int) -> Row:
+    with progress.step(work.name) as step:
+        measured = []
+        for run in range(runs):
+            step.at(run, runs, "runs")
+            measured.append(_run(work))
+    return _row(work, measured)
+
+
+def _run(work: Work) -> tuple[float, float, int]:
+    """Seconds, processor seconds and bytes of one run."""
+    work.prepare()
+    started, used = time.monotonic(), _processor()
+    size = work.make()
+    return time.monotonic() - started, _processor() - used, size
+
+
+def _row(work: Work, measured: list[tuple[float, float, int]]) -> Row:
+    seconds, processor, sizes = zip(*measured, strict=True)
+    median = statistics.median
+    return Row(work.name, work.made, median(seconds), median(processor), sizes[-1], len(measured))
 
 
 def _processor() -> float:

@@ -91,15 +91,15 @@ def tools(directory: Path, source: str | None = None) -> None:
         archive.unlink()
 
 
-def command(mkosi: str, directory: Path, repository: Path, lock: Lock) -> list[str]:
-    """What makes `directory`/disk.raw of `prepare`'s files, `tools`' in `directory`/tools, and a package repository."""
+def command(mkosi: str, directory: Path, tools: Path, repository: Path, lock: Lock) -> list[str]:
+    """What makes `directory`/disk.raw of `prepare`'s files, with `tools`' programs, from a package repository."""
     modules = [f"^{fnmatch.translate(f'{pattern}.ko')}" for pattern in rootfs.module_patterns(lock.architecture)]
     return [
         mkosi, f"--directory={directory}", "--build-sources=", "--distribution=debian", f"--release={lock.release}",
         f"--architecture={_ARCHITECTURES[lock.architecture]}", f"--local-mirror=file://{repository}",
         "--repository-key-check=no", "--with-docs=no", f"--source-date-epoch={lock.epoch}", "--manifest-format=",
         f"--workspace-directory={directory}/workspace", f"--package-cache-dir={directory}/packages",
-        f"--tools-tree={directory}/tools", f"--sandbox-tree={directory}/sandbox", f"--extra-tree={directory}/grub",
+        f"--tools-tree={tools}", f"--sandbox-tree={directory}/sandbox", f"--extra-tree={directory}/grub",
         "--format=disk", "--output=disk", f"--repart-directory={directory}/partitions",
         "--bootable=yes", "--bootloader=none", "--bios-bootloader=grub",
         f"--initrd={directory}/initrd.img", f"--kernel-command-line={_ARGUMENTS}",

@@ -12,7 +12,7 @@ import pytest
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
 from images.builder import bench, bench_mkosi, bench_robots, card
-from images.builder.bench import Row, table
+from images.builder.bench import Row, Work, table
 from images.builder.lock import read_lock
 
 
@@ -32,9 +32,25 @@ def test_a_row_has_the_processor_time_of_its_processes() -> None:
         subprocess.run([sys.executable, "-c", burn], check=True)
         return 7
 
-    row = bench._measure("work", "made", make, 3)
+    row = bench._measure(Work("work", "made", make), 3)
     assert row.processor >= 0.3
     assert (row.bytes, row.runs) == (7, 3)
+
+
+def test_what_is_compared_runs_in_turn_and_is_prepared_each_time() -> None:
+    """Seen to fail with all runs of the one before the first of the other."""
+    done: list[str] = []
+
+    def work(name: str) -> Work:
+        def make() -> int:
+            done.append(name)
+            return len(done)
+
+        return Work(name, "made", make, lambda: done.append(f"before {name}"))
+
+    rows = bench._in_turn([work("ours"), work("theirs")], 2)
+    assert done == ["before ours", "ours", "before theirs", "theirs"] * 2
+    assert [(row.work, row.bytes, row.runs) for row in rows] == [("ours", 6, 2), ("theirs", 8, 2)]
 
 
 def test_mkosi_is_the_users_to_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +99,7 @@ def test_mkosi_makes_a_disk_like_the_card(tmp_path: Path) -> None:
     )
     assert "linux-initramfs-tool" in stub.stdout
 
-    argv = bench_mkosi.command("bin/mkosi", directory, tmp_path / "repository", lock)
+    argv = bench_mkosi.command("bin/mkosi", directory, tmp_path / "tools", tmp_path / "repository", lock)
     assert {f"--package={package.name}" for package in lock.packages} < set(argv)
     assert {"--format=disk", "--bios-bootloader=grub", "--architecture=x86"} < set(argv)
     (arguments,) = (each for each in argv if each.startswith("--kernel-command-line="))

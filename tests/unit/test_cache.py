@@ -50,7 +50,8 @@ def test_a_failed_step_leaves_nothing_that_could_be_taken_for_a_result(capsys: p
 
 def test_work_that_a_full_disk_made_fail_says_so_when_other_work_has_made_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """As a compiler that is unpacked beside a root file system. With `free` asked at the end alone, this failed."""
-    free, usage = [0], namedtuple("usage", "free")
+    usage = namedtuple("usage", "free")
+    free = [0]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(free[0]))
     monkeypatch.setattr(host, "_was_full", threading.Event())
     removed = threading.Event()
