@@ -37,6 +37,7 @@ LONGEST = (
     "test_blocks_guest.py",
     "test_wheeled_live.py",
     "test_wheeled_virtual.py",
+    "test_wire_flood.py",
     "test_virtual_loop.py",
     "test_boot_time.py",
 )

@@ -186,9 +186,9 @@ def sysctl_drift() -> list[list[str]]:
 
 
 def firewall_is_loaded() -> bool:
-    """Whether the rules in force are those that the file makes in a network that has none."""
-    made = "nft -f /etc/nftables.conf && nft -s list ruleset"
-    return output("nft", "-s", "list", "ruleset") == output("unshare", "--net", "sh", "-c", made)
+    """Whether the rules in force are those that the file makes in a network that has none, whatever they counted."""
+    made = "nft -f /etc/nftables.conf && nft -s -t list ruleset"
+    return output("nft", "-s", "-t", "list", "ruleset") == output("unshare", "--net", "sh", "-c", made)
 
 
 def app_unit(name: str) -> str:

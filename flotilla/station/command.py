@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
         if arguments.top:
             services = Services(fleet.robots.values() if arguments.ask else ())
             dialog = Dialog({robot.name: robot for robot in fleet.robots.values()})
-            top = Top(receiver, services.states, dialog, cells=services.cells)
+            top = Top(receiver, services.states, dialog, notes=services.notes)
             receiver.sinks.append(top)
             if not doing and not top.console.is_terminal:
                 seconds = seconds or TOP_S

@@ -1,5 +1,5 @@
-"""Whether control tasks run, and how, and the radio cell: asked of each robot by ssh every ASK_S, over one connection
-that stays."""
+"""Whether control tasks run, and how, the radio cell and floods: asked of each robot by ssh every ASK_S, over one
+connection that stays."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shlex
 import subprocess
 import threading
 import time
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,8 @@ _END = "."
 _CELL = "/run/flotilla/cell"
 """What the robot's service `flotilla-cell@` writes."""
 _IN_THE_CELL = "in the cell"
+_FLOOD = "nft --json list chain inet flotilla flood"
+"""What the robot's firewall dropped as too many; /etc/nftables.conf."""
 _PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
 _SETTINGS = ("ConnectTimeout=5", "ServerAliveInterval=5", "ServerAliveCountMax=2")
 
@@ -57,18 +59,19 @@ class Answer:
 
     tasks: dict[str, State]
     """By name."""
-    cell: str = ""
-    """What is to be said of its place in the ad hoc cell: how often it was lost, and why. Empty: nothing."""
+    notes: tuple[str, ...] = ()
+    """What else is to be said of it: how often it lost its place in the ad hoc cell, and why; what its firewall dropped
+    as a flood."""
 
 
 def ask(robot: Robot) -> Generator[Answer, None, None]:
     """What it says, again and again, until UserError says why it does not answer any more."""
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
-    longest = 2 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
+    longest = 3 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
     status = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
-    cell = f"cat {_CELL} 2>/dev/null || echo"
-    script = f"while cat /proc/uptime && {show} && {{ {status}; {cell}; }} && echo {_END}; do sleep {ASK_S}; done"
+    notes = f"cat {_CELL} 2>/dev/null || echo; {_FLOOD} 2>/dev/null || echo null"
+    script = f"while cat /proc/uptime && {show} && {{ {status}; {notes}; }} && echo {_END}; do sleep {ASK_S}; done"
     before: dict[str, State] = {}
     program, *way = ssh.command(robot)
     options = [word for setting in _SETTINGS for word in ("-o", setting)]
@@ -84,15 +87,24 @@ def ask(robot: Robot) -> Generator[Answer, None, None]:
                     lines.append(line)
                     continue
                 try:
-                    *lines, cell = lines
+                    *lines, cell, flood = lines
                     before = _states(lines[: -len(units)], lines[-len(units) :], before)
-                    yield Answer(before, "" if cell.strip() == _IN_THE_CELL else cell.strip())
+                    yield Answer(before, tuple(_notes(cell.strip(), json.loads(flood))))
                 except (ValueError, KeyError, TypeError) as error:
                     raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {error!r}") from error
                 lines = []
             raise ssh.no_answer(robot, process.stderr.read().strip() or "the connection broke")
         finally:
             process.kill()
+
+
+def _notes(cell: str, flood: dict[str, Any] | None) -> Iterator[str]:
+    """`flood`: a chain as libnftables-json(5) describes it; None: the robot has none."""
+    if cell not in ("", _IN_THE_CELL):
+        yield f"radio {cell}"
+    rules = [each["rule"]["expr"] for each in flood["nftables"] if "rule" in each] if flood else []
+    if packets := sum(part["counter"]["packets"] for rule in rules for part in rule if "counter" in part):
+        yield f"firewall dropped {packets} packets of a flood"
 
 
 def _states(lines: list[str], reported: list[str], before: dict[str, State]) -> dict[str, State]:
@@ -136,8 +148,8 @@ class Services:
         asked = [robot for robot in robots if robot.control_tasks]
         self.states = {(robot.name, task): State("asked", True) for robot in asked for task in robot.control_tasks}
         """By robot and task, as they were reported last."""
-        self.cells: dict[str, str] = {}
-        """By robot, what is to be said of its place in the ad hoc cell."""
+        self.notes: dict[str, tuple[str, ...]] = {}
+        """By robot, what else is to be said of it."""
         for robot in asked:
             ssh.command(robot)
             threading.Thread(target=self._follow, args=(robot,), daemon=True).start()
@@ -148,7 +160,7 @@ class Services:
                 for answer in ask(robot):
                     for task, state in answer.tasks.items():
                         self.states[robot.name, task] = state
-                    self.cells[robot.name] = answer.cell
+                    self.notes[robot.name] = answer.notes
             except UserError:
                 for task in robot.control_tasks:
                     self.states[robot.name, task] = State("no answer", False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
@@ -155,16 +155,16 @@ class Top:
         states: Mapping[tuple[str, str], State] = MappingProxyType({}),
         dialog: Dialog | None = None,
         clock: Callable[[], int] = time.time_ns,
-        cells: Mapping[str, str] = MappingProxyType({}),
+        notes: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
-        """`cells`: by robot, what is to be said of its place in the ad hoc cell."""
+        """`notes`: by robot, what else it says."""
         self.console = Console()
         self._known = sorted(receiver.known.values(), key=lambda stream: stream.topic)
         self._receiver = receiver
         self._states = states
         self._dialog = dialog
         self._clock = clock
-        self._cells = cells
+        self._notes = notes
         self._stats = {stream.topic: StreamStats(stream, clock()) for stream in self._known}
         self._live: Live | None = None
 
@@ -249,7 +249,7 @@ class Top:
             table.add_row(robot, task, period, *[""] * (len(_TITLES) - 3), *_asked(state))
         if chosen is not None:
             table.rows[chosen].style = "reverse"
-        notes += [f"{robot}: radio {said}" for robot, said in sorted(self._cells.items()) if said]
+        notes += [f"{robot}: {note}" for robot, said in sorted(self._notes.items()) for note in said]
         if self._receiver.strangers:
             notes.append(f"{self._receiver.strangers} datagrams of strangers left out")
         if notes:

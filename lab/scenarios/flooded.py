@@ -34,6 +34,14 @@ def within(computer: str, *argv: str) -> None:
     fly.run("chrt", "--fifo", str(_PRIORITY), "ip", "netns", "exec", computer, *argv)
 
 
+def firewalled(computer: str) -> int:
+    """Packets that its firewall has dropped as too many."""
+    argv = ["ip", "netns", "exec", computer, "nft", "--json", "list", "chain", "inet", "flotilla", "flood"]
+    listed = json.loads(subprocess.run(argv, check=True, capture_output=True).stdout)["nftables"]
+    parts = [part for each in listed for part in each.get("rule", {}).get("expr", ())]
+    return sum(int(part["counter"]["packets"]) for part in parts if "counter" in part)
+
+
 def frames(computer: str) -> int:
     """That the adapter has taken."""
     argv = ["ip", "netns", "exec", computer, "cat", str(_RECEIVED)]
@@ -63,11 +71,13 @@ def phase(tasks: list[dict[str, Any]], *, flooded: bool) -> dict[str, Any]:
 
 
 def counted(sends: dict[str, Any], takes: dict[str, Any]) -> dict[str, int]:
-    received = exchange.outputs(takes, "in.sequence", "in.forged", "in.dropped")
+    received = exchange.outputs(takes, "in.sequence", "in.forged", "in.refused", "in.dropped")
     return {
         "frames": frames(takes["computer"]),
+        "firewalled": firewalled(takes["computer"]),
         "messages": received["in.sequence"],
         "forged": received["in.forged"],
+        "refused": received["in.refused"],
         "dropped": received["in.dropped"],
         "sent": exchange.outputs(sends, "out.sent")["out.sent"],
     }

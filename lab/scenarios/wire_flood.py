@@ -1,8 +1,9 @@
 """A flood from the cable against two robots that exchange messages, in virtual time.
 
 As for `message_cost`, two computers are namespaces of one guest. The receiver has an Ethernet adapter, too, from which
-datagrams come as from the sender: right in address, port and length, wrong in their proof. They come from outside the
-guest (lab/air/wire.c), so that the rate does not depend on what the guest does.
+datagrams come as from the sender: right in address, port and length, wrong in their proof; or from many addresses of
+the fleet's network, one after the other. They come from outside the guest (lab/air/wire.c), so that the rate does not
+depend on what the guest does.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import random
 import socket
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from lab.scenarios.virtual import DIRECTORY
 
 _ADAPTER = "52:54:00:f1:00:02"
 _FRAMES = 64
+_MANY = 200
 _PROOF_BYTES = 40
 _ALONE = """
 period: 10 ms
@@ -46,18 +49,22 @@ class Flooded:
     """Messages of the sender."""
     forged: int
     """Datagrams that the receiver refused for their proof."""
+    refused: int
+    """Datagrams that it refused for their address."""
     dropped: int
     """Datagrams that its queue had no room for."""
+    firewalled: int
+    """Datagrams that its firewall dropped as too many."""
     overruns: dict[str, int]
     """By task."""
     longest_ns: dict[str, int]
     """Step, by task."""
 
 
-def frames(source: str, target: str, port: int, bytes_: int) -> bytes:
-    """Forged datagrams as lab/air/wire.c reads them."""
+def frames(sources: Sequence[str], target: str, port: int, bytes_: int) -> bytes:
+    """Forged datagrams as lab/air/wire.c reads them, from each source in turn."""
     made = b""
-    for number in range(_FRAMES):
+    for number, source in enumerate(sources):
         payload = random.Random(number).randbytes(bytes_)
         datagram = struct.pack("!HHHH", port, port, 8 + len(payload), 0) + payload
         header = struct.pack(
@@ -72,8 +79,8 @@ def frames(source: str, target: str, port: int, bytes_: int) -> bytes:
     return made
 
 
-def measure(board: Board, out: Path, rate_hz: int) -> dict[str, Flooded]:
-    """Before the flood and during it: `quiet` and `flooded`."""
+def measure(board: Board, out: Path, rate_hz: int, *, many: bool = False) -> dict[str, Flooded]:
+    """Before the flood and during it: `quiet` and `flooded`. `many`: it forges many addresses, none of a sender."""
     out.mkdir(parents=True, exist_ok=True)
     described = virtual.fleet("udp", board=board)
     sender, receiver = described.robot_with("control"), described.robot_with("thruster-mapping")
@@ -85,8 +92,9 @@ def measure(board: Board, out: Path, rate_hz: int) -> dict[str, Flooded]:
     there[f"{alone['directory']}-alone/alone.yml"] = _ALONE.encode()
     there[f"{DIRECTORY}/flood.json"] = json.dumps(exchange | {"adapter": _ADAPTER}).encode()
     block = message_cost.received(described, out / "keys")
+    sources = [*map(str, described.network.subnet.hosts())][-_MANY:] if many else [str(sender.address)] * _FRAMES
     (out / "frames").write_bytes(
-        frames(str(sender.address), str(receiver.address), int(block["port"]), int(block["length"]) + _PROOF_BYTES)
+        frames(sources, str(receiver.address), int(block["port"]), int(block["length"]) + _PROOF_BYTES)
     )
     (out / "wire.so").write_bytes(air.compiled(air.WIRE, HOST))
     file, plugin = (str(out / name).replace(",", ",,") for name in ("frames", "wire.so"))

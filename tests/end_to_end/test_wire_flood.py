@@ -1,4 +1,6 @@
-"""A flood from the cable, in virtual time: forged datagrams at the port of a control task, from outside the guest."""
+"""A flood from the cable, in virtual time: forged datagrams at the port of a control task, from outside the guest.
+
+From one address, the sender's; or from many, which the firewall counts by interface only."""
 
 from __future__ import annotations
 
@@ -8,25 +10,26 @@ import pytest
 
 from lab.scenarios import flooded, virtual, wire_flood
 
-pytestmark = pytest.mark.nightly
-
-RATE_HZ = 5000
-"""With 8,000 a processor of 125 million instructions a second is full: Linux takes 50 ms of each second from all
-real-time threads then, for those that starve, so that control is late."""
+RATE_HZ = 20_000
+_IP_DROPS = 8
+"""Packets, at most, that come while the interface goes up or down, which the kernel counts as none of these."""
 
 
-def test_a_flood_from_the_cable(artefacts: Path) -> None:
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.nightly)], ids=["one", "many"])
+def test_a_flood_from_the_cable(artefacts: Path, many: bool) -> None:
     """None is taken, all are counted, no message is lost, and no task is late: neither the one that refuses, nor the
-    sender, nor one without messages. Seen to fail with 8,000 a second: each task had some ten overruns."""
+    sender, nor one without messages. Seen to fail without the firewall's limit and the adapter's settings: the tasks
+    had some ten overruns each of 8,000 packets a second, and thousands of 20,000."""
     board = virtual.fleet("udp").board().model_copy(update={"kernel": "lean"})
-    found = wire_flood.measure(board, artefacts, RATE_HZ)
+    found = wire_flood.measure(board, artefacts, RATE_HZ, many=many)
     for name, each in found.items():
         print(f"{name}: {each}")
     quiet, under = found["quiet"], found["flooded"]
-    assert (quiet.frames, quiet.forged) == (0, 0)
+    assert (quiet.frames, quiet.forged, quiet.firewalled) == (0, 0, 0)
     assert under.frames > 0.99 * RATE_HZ * flooded.SECONDS
-    assert under.forged + under.dropped == under.frames
-    assert under.dropped < 0.01 * under.frames
+    counted = under.forged + under.refused + under.dropped + under.firewalled
+    assert 0 <= under.frames - counted <= _IP_DROPS
     for each in (quiet, under):
-        assert abs(each.sent - each.messages) <= 2, "messages are lost"  # counted one after the other
+        lost = 0.01 * each.sent if many else 2  # sent and taken are counted one after the other
+        assert abs(each.sent - each.messages) <= lost
         assert set(each.overruns.values()) == {0}

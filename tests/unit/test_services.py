@@ -104,17 +104,47 @@ def test_what_tasks_say_of_themselves(robot: Path) -> None:
 
 @pytest.mark.parametrize(
     ("written", "said"),
-    [("in the cell", ""), (LOST := "in the cell; joined again 2 times, last because it had left it", LOST)],
+    [
+        ("in the cell", ()),
+        (LOST := "in the cell; joined again 2 times, last because it had left it", (f"radio {LOST}",)),
+    ],
 )
-def test_what_a_robot_says_of_the_cell(robot: Path, written: str, said: str) -> None:
+def test_what_a_robot_says_of_the_cell(robot: Path, written: str, said: tuple[str, ...]) -> None:
     """Seen to fail with the line taken for a task's, too."""
     say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
     tell(robot, valves=7, sensors=0)
     program(robot, "cat", f'#!/bin/sh\n[ "$*" = /proc/uptime ] && echo 153.54 93.80 || echo "{written}"\n')
     with closing(ask(ROBOT)) as answers:
         first = next(answers)
-    assert (first.cell, sorted(first.tasks)) == (said, ["sensors", "valves"])
+    assert (first.notes, sorted(first.tasks)) == (said, ["sensors", "valves"])
     assert first.tasks["valves"].status
+
+
+CHAIN = """{"nftables": [
+{"metainfo": {"version": "1.0.6", "release_name": "Lester Gooch #5", "json_schema_version": 1}},
+{"chain": {"family": "inet", "table": "flotilla", "name": "flood", "handle": 1, "type": "filter", "hook": "prerouting",
+"prio": -450, "policy": "accept"}},
+{"rule": {"family": "inet", "table": "flotilla", "chain": "flood", "handle": 6, "expr": [
+{"match": {"op": "==", "left": {"meta": {"key": "iif"}}, "right": "lo"}}, {"accept": null}]}},
+{"rule": {"family": "inet", "table": "flotilla", "chain": "flood", "handle": 7, "expr": [
+{"match": {"op": "!=", "left": {"meta": {"key": "l4proto"}}, "right": 6}},
+{"counter": {"packets": PACKETS, "bytes": 9}}, {"drop": null}]}},
+{"rule": {"family": "inet", "table": "flotilla", "chain": "flood", "handle": 8, "expr": [
+{"match": {"op": "==", "left": {"meta": {"key": "l4proto"}}, "right": 6}},
+{"limit": {"rate": 4000, "burst": 800, "per": "second", "inv": true}},
+{"counter": {"packets": PACKETS, "bytes": 9}}, {"drop": null}]}}]}"""
+
+
+@pytest.mark.parametrize(("packets", "said"), [(70, ("firewall dropped 140 packets of a flood",)), (0, ())])
+def test_what_the_firewall_dropped(robot: Path, packets: int, said: tuple[str, ...]) -> None:
+    """As nft 1.0.6 says it. Seen to fail without the chain in what is asked."""
+    say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
+    tell(robot, valves=7, sensors=0)
+    counter = CHAIN.replace("PACKETS", str(packets)).replace("\n", " ")
+    program(robot, "nft", f"""#!/bin/sh\n[ "$*" = "--json list chain inet flotilla flood" ] && echo '{counter}'\n""")
+    with closing(ask(ROBOT)) as answers:
+        first = next(answers)
+    assert (first.notes, sorted(first.tasks)) == (said, ["sensors", "valves"])
 
 
 def until(answers: Iterator[Answer], wanted: dict[str, State]) -> bool:

@@ -146,6 +146,14 @@ def test_what_a_robot_refused_is_named() -> None:
     assert top.end().splitlines()[-1].strip() == "robot1: heading refused messages: 410 forged"
 
 
+def test_what_else_a_robot_says_is_below_the_table() -> None:
+    """Seen to fail without the robot's name."""
+    notes = {"robot3": ("radio off", "firewall dropped 7 packets of a flood"), "robot1": ()}
+    said = Top(Receiver(streams(load_fleet())), clock=lambda: 0, notes=notes).end().splitlines()
+    assert said[-2].strip() == "robot3: radio off"
+    assert said[-1].strip() == "robot3: firewall dropped 7 packets of a flood"
+
+
 def test_the_rate_is_the_message_s() -> None:
     one = Signal(type="double", unit=["1"])
     (stream,) = streams(reporting(100, 4, left=one))

@@ -38,7 +38,7 @@ def test_interrupt_threads_have_their_priorities(robot: RobotGuest, board: Board
         if (policy, priority) != ("FF", wanted[-1]):
             wrong.append(f"{name}: {policy} {priority} instead of {wanted[-1]}")
     assert not wrong, "; ".join(wrong)
-    expected = {f"-{board.network_interface}"}
+    expected = {f"-{board.network_interface}", f"napi/{board.network_interface}-"}
     # Ports on one interrupt have one thread, named after the first of them that was opened.
     if robot.robot.devices:
         expected.add("-ttyS")
