@@ -113,8 +113,15 @@ int fl_add_input(struct fl_block *block, struct fl_port port)
     return result;
 }
 
+bool fl_output_possible(const struct fl_port *port)
+{
+    return !(port->flags & FL_REFUSALS) || (port->type == FL_UINT32 && port->width == 1);
+}
+
 int fl_add_output(struct fl_block *block, struct fl_port port)
 {
+    if (!fl_output_possible(&port))
+        return fl_fail(block, "output %s counts refusals and is not one uint32", port.name);
     int result = add_port(block, &block->service->out_ports, &block->out_count, port);
     block->out_ports = block->service->out_ports;
     return result;

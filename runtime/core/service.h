@@ -40,6 +40,9 @@ struct fl_service {
     bool overrun_ends; /* why the step failed */
 };
 
+/* Whether an output's type and width go with its flags. */
+bool fl_output_possible(const struct fl_port *port);
+
 /* Call enter(argument) with a stack beside it for signal handlers, so that they can run when the own stack of the
  * thread is used up. */
 void *fl_service_enter(void *(*enter)(void *), void *argument);

@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "registry.h"
 
+#include "core/service.h"
+
 #include <dlfcn.h>
 #include <glob.h>
 #include <stdlib.h>
@@ -40,6 +42,9 @@ static const char *fault(const struct registry *registry, const struct fl_block_
         if (parameter->offset >= type->parameters_size)
             return "a parameter lies outside its structure";
     }
+    for (uint32_t i = 0; i < type->output_count; i++)
+        if (!fl_output_possible(&type->outputs[i]))
+            return "an output that counts refusals is not one uint32";
     return NULL;
 }
 

@@ -17,6 +17,13 @@ struct sensor {
     _Atomic float put_age; /* every processor writes four bytes atomically */
 };
 
+/* An output with FL_REFUSALS. */
+struct refusals {
+    const char *block, *output;
+    const uint32_t *count;
+    _Atomic uint32_t put_count;
+};
+
 /* A sequence lock: `turn` is odd while the control thread writes. All of its writes have release order, so a reader
  * that sees any of them also sees that `turn`. */
 struct status {
@@ -26,6 +33,8 @@ struct status {
     _Atomic int64_t overrun_ns, late_ns;
     const struct task *task;
     int64_t begun_ns;
+    struct refusals *refusals; /* those of a block side by side */
+    size_t refusals_count;
     size_t count;
     struct sensor sensors[];
 };
@@ -33,6 +42,7 @@ struct status {
 struct reading {
     uint64_t steps, overruns, skipped, timeouts, overrun_step;
     int64_t overrun_ns, late_ns;
+    uint32_t *refusals;
     struct {
         bool flag;
         float age;
@@ -59,6 +69,23 @@ static int sensor_port(const struct fl_block *block)
     return -1;
 }
 
+static void find_refusals(struct status *status, const struct task *task)
+{
+    size_t most = 0;
+    for (size_t i = 0; i < task->count; i++)
+        most += task->blocks[i].block->out_count;
+    status->refusals = calloc(most + 1, sizeof *status->refusals);
+    if (!status->refusals)
+        abort();
+    for (size_t i = 0; i < task->count; i++) {
+        const struct fl_block *block = task->blocks[i].block;
+        for (uint32_t port = 0; port < block->out_count; port++)
+            if (block->out_ports[port].flags & FL_REFUSALS)
+                status->refusals[status->refusals_count++] = (struct refusals){
+                    .block = block->name, .output = block->out_ports[port].name, .count = block->out[port]};
+    }
+}
+
 struct status *status_create(const struct task *task)
 {
     size_t bytes = sizeof(struct status) + task->count * sizeof(struct sensor);
@@ -69,6 +96,7 @@ struct status *status_create(const struct task *task)
     status->task = task;
     status->begun_ns = fl_now_ns();
     atomic_init(&status->ended_ns, status->begun_ns + FIRST_PERIODS * task->period_ns);
+    find_refusals(status, task);
     for (size_t i = 0; i < task->count; i++) {
         const struct fl_block *block = task->blocks[i].block;
         int port = sensor_port(block);
@@ -81,6 +109,8 @@ struct status *status_create(const struct task *task)
 
 void status_destroy(struct status *status)
 {
+    if (status)
+        free(status->refusals);
     free(status);
 }
 
@@ -102,6 +132,8 @@ void status_put(struct status *status, const struct run_result *result, int64_t 
         PUT(sensor->put_flag, *sensor->flag);
         PUT(sensor->put_age, (float)*sensor->age);
     }
+    for (struct refusals *each = status->refusals, *end = each + status->refusals_count; each < end; each++)
+        PUT(each->put_count, *each->count);
     PUT(status->turn, turn + 2);
 }
 
@@ -115,12 +147,12 @@ int64_t status_ended_ns(const struct status *status)
     return GET(status->ended_ns);
 }
 
-/* Copy the state; to be freed. Repeats while the control thread writes, which takes well under a microsecond of each
- * period. */
+/* Copy the state; to be freed, after its `refusals`. Repeats while the control thread writes, which takes well under a
+ * microsecond of each period. */
 static struct reading *read_status(const struct status *status)
 {
     struct reading *reading = calloc(1, sizeof *reading + status->count * sizeof reading->sensors[0]);
-    if (!reading)
+    if (!reading || !(reading->refusals = calloc(status->refusals_count + 1, sizeof *reading->refusals)))
         abort();
     for (;; sched_yield()) {
         uint32_t turn = GET(status->turn);
@@ -135,6 +167,8 @@ static struct reading *read_status(const struct status *status)
             reading->sensors[i].flag = GET(status->sensors[i].put_flag);
             reading->sensors[i].age = GET(status->sensors[i].put_age);
         }
+        for (size_t i = 0; i < status->refusals_count; i++)
+            reading->refusals[i] = GET(status->refusals[i].put_count);
         if (turn % 2 == 0 && turn == atomic_load_explicit(&status->turn, memory_order_relaxed))
             return reading;
     }
@@ -143,6 +177,30 @@ static struct reading *read_status(const struct status *status)
 static double seconds(int64_t ns)
 {
     return (double)ns / 1e9;
+}
+
+/* The counts that are not 0, those of a block together; what stands around names depends on `json`. */
+static void write_refusals(const struct status *status, const struct reading *reading, bool json, FILE *out)
+{
+    const char *block = NULL; /* the one before */
+    for (size_t i = 0; i < status->refusals_count; i++) {
+        const struct refusals *each = &status->refusals[i];
+        if (!reading->refusals[i])
+            continue;
+        if (each->block == block)
+            fputs(", ", out);
+        else if (json)
+            fprintf(out, "%s\"%s\": {", block ? "}, " : "", each->block);
+        else
+            fprintf(out, "%srefused by %s: ", block ? "\n" : "", each->block);
+        if (json)
+            fprintf(out, "\"%s\": %" PRIu32, each->output, reading->refusals[i]);
+        else
+            fprintf(out, "%" PRIu32 " %s", reading->refusals[i], each->output);
+        block = each->block;
+    }
+    if (block)
+        fputs(json ? "}" : "\n", out);
 }
 
 static void write_json(const struct status *status, const struct reading *reading, int64_t now_ns, FILE *out)
@@ -160,6 +218,8 @@ static void write_json(const struct status *status, const struct reading *readin
     for (size_t i = 0; i < status->count; i++)
         fprintf(out, "%s\"%s\": {\"flag\": %s, \"age_s\": %.6f}", i ? ", " : "", status->sensors[i].name,
                 reading->sensors[i].flag ? "true" : "false", (double)reading->sensors[i].age);
+    fputs("}, \"refused\": {", out);
+    write_refusals(status, reading, true, out);
     fputs("}}\n", out);
 }
 
@@ -175,11 +235,13 @@ static void write_text(const struct status *status, const struct reading *readin
     for (size_t i = 0; i < status->count; i++)
         fprintf(out, "%s: flag %d, age %.3f s\n", status->sensors[i].name, reading->sensors[i].flag,
                 (double)reading->sensors[i].age);
+    write_refusals(status, reading, false, out);
 }
 
 void status_write(const struct status *status, bool json, FILE *out)
 {
     struct reading *reading = read_status(status);
     (json ? write_json : write_text)(status, reading, fl_now_ns(), out);
+    free(reading->refusals);
     free(reading);
 }

@@ -137,6 +137,47 @@ def test_a_plugin_of_another_interface_is_refused(tasks: Tasks, tmp_path: Path) 
     assert "there is no block misbehave" in lines[-1]
 
 
+COUNTING = """#include <flotilla/block.h>
+
+static const struct fl_port outputs[] = {{.name = "count", .flags = FL_REFUSALS, PORT}};
+
+__attribute__((unused)) static int configure(struct fl_block *block)
+{
+    return fl_add_output(block, outputs[0]);
+}
+
+static int step(struct fl_block *block)
+{
+    (void)block;
+    return FL_OK;
+}
+
+FL_BLOCK(counting) = {.abi = FL_ABI, .name = "counting", .step = step, OUTPUTS};
+"""
+
+
+@pytest.mark.parametrize("port", [".type = FL_UINT64, .width = 1", ".type = FL_UINT32, .width = 2"])
+@pytest.mark.parametrize(
+    ("outputs", "said"),
+    [
+        ("FL_TABLE(output, outputs)", "block counting: an output that counts refusals is not one uint32"),
+        (".configure = configure", "block a: output count counts refusals and is not one uint32"),
+    ],
+)
+def test_what_counts_refusals_is_one_uint32(tasks: Tasks, tmp_path: Path, port: str, outputs: str, said: str) -> None:
+    """The status reads four bytes. Seen to fail without the check of the table, and without that of what is added."""
+
+    def plugin(port: str) -> None:
+        (tmp_path / "counting.c").write_text(COUNTING.replace("PORT", port).replace("OUTPUTS", outputs))
+        compile_shared(tmp_path / "counting.c", tmp_path / "counting.so", f"-I{HEADERS}")
+
+    own = Tasks(tasks.program, tmp_path, tmp_path)
+    plugin(port)
+    assert said in own.refusal(task("a: {type: counting}"))[0]
+    plugin(".type = FL_UINT32, .width = 1")
+    assert own.run(task("a: {type: counting}"), "--steps", "1").status == 0
+
+
 def test_plugins_come_from_several_directories_where_one_may_be_missing(tasks: Tasks, tmp_path: Path) -> None:
     """Seen to fail when only the first directory is read."""
     own = tmp_path / "own"

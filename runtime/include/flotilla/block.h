@@ -55,6 +55,8 @@ enum {
     /* input: reads the source's value of the previous step, because the block runs before its source; so it may close a
        loop of wires */
     FL_DELAYED = 1u << 1,
+    /* output, uint32 of width 1: counts what others sent and the block refused; the task's status names it */
+    FL_REFUSALS = 1u << 2,
 };
 
 struct fl_port {
