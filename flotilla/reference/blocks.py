@@ -54,6 +54,8 @@ What a task can be made of. [Task file](task-file.md) says how a task names them
 
 - An optional input reads zero without a wire. A delayed input reads its source's value of the previous step, so it may
   close a loop of wires.
+- An output marked as refusals counts what others sent and the block refused; `flotilla-param --status` and
+  `make top ASK=1` name it if it is not 0.
 - A tunable parameter may change while the task runs (`make param`). An exclusive one names a device, alone or with the
   others that are exclusive: one block may have it.
 - `doubles` and `strings` are lists, or one value. A `device` is a path that begins with a slash.
@@ -139,7 +141,7 @@ def _verbatim(paragraphs: list[str]) -> str:
 
 def _port(port: dict[str, Any]) -> tuple[str, str, str, str]:
     width = f"\\[{port['width']}\\]" if port["width"] > 1 else ""
-    flags = "".join(f"; {flag}" for flag in ("optional", "delayed") if port.get(flag))
+    flags = "".join(f"; {flag}" for flag in ("optional", "delayed", "refusals") if port.get(flag))
     return code(port["name"]), port["type"] + width, port.get("unit", ""), literal(port.get("summary", "")) + flags
 
 

@@ -160,20 +160,21 @@ void authentication_sign(struct authentication_sender *sender, uint8_t *message,
     tag_message(&sender->messages, message, length, trailer, trailer + SIGNED);
 }
 
-bool authentication_challenged(struct authentication_sender *sender, const uint8_t *bytes, size_t length)
+enum authentication_verdict authentication_challenged(struct authentication_sender *sender, const uint8_t *bytes,
+                                                      size_t length)
 {
     uint8_t tag[TAG];
-    if (length != AUTHENTICATION_CHALLENGE || get(bytes + SESSION) != sender->session)
-        return false;
-    uint64_t counter = get(bytes + COUNTER);
-    if (counter <= sender->challenged || counter > sender->counter)
-        return false;
+    if (length != AUTHENTICATION_CHALLENGE)
+        return AUTHENTICATION_FORGED;
     tag_challenge(&sender->challenges, sender->port, bytes, tag);
     if (!memeql_sec(tag, bytes + SIGNED, TAG))
-        return false;
+        return AUTHENTICATION_FORGED;
+    uint64_t counter = get(bytes + COUNTER);
+    if (get(bytes + SESSION) != sender->session || counter <= sender->challenged || counter > sender->counter)
+        return AUTHENTICATION_REPLAYED;
     sender->challenged = counter;
     sender->answer = get(bytes + ANSWER);
-    return true;
+    return AUTHENTICATION_GOOD;
 }
 
 /* --- receiving --- */

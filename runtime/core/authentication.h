@@ -42,6 +42,13 @@ enum authentication_direction { AUTHENTICATION_TO, AUTHENTICATION_FROM };
 int authentication_read_key(struct fl_block *block, const char *file, struct in_addr address,
                             enum authentication_direction direction, uint8_t key[AUTHENTICATION_KEY]);
 
+enum authentication_verdict {
+    AUTHENTICATION_GOOD,
+    AUTHENTICATION_FORGED,     /* the tag is wrong */
+    AUTHENTICATION_REPLAYED,   /* it came before, or a newer one did */
+    AUTHENTICATION_UNANSWERED, /* of a message: send it the challenge */
+};
+
 /* --- sending --- */
 
 struct authentication_sender {
@@ -62,8 +69,10 @@ void authentication_sender_begin(struct authentication_sender *sender, const uin
  * second; then a new one begins. */
 void authentication_sign(struct authentication_sender *sender, uint8_t *message, size_t length);
 
-/* Take what came back. False: it is no challenge of the receiver to this session, or an older one. */
-bool authentication_challenged(struct authentication_sender *sender, const uint8_t *bytes, size_t length);
+/* Take what came back. AUTHENTICATION_FORGED also where it has another length than a challenge; a challenge of the
+ * receiver to another session is AUTHENTICATION_REPLAYED. */
+enum authentication_verdict authentication_challenged(struct authentication_sender *sender, const uint8_t *bytes,
+                                                      size_t length);
 
 /* --- receiving --- */
 
@@ -76,13 +85,6 @@ struct authentication_receiver {
     uint64_t session;
     uint64_t counter;
     uint64_t answer;
-};
-
-enum authentication_verdict {
-    AUTHENTICATION_GOOD,
-    AUTHENTICATION_FORGED,     /* the tag is wrong */
-    AUTHENTICATION_REPLAYED,   /* it came before, or a newer one did */
-    AUTHENTICATION_UNANSWERED, /* send it the challenge */
 };
 
 /* From nobody yet. Not for the step. */

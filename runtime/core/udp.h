@@ -92,7 +92,11 @@ struct udp_receiver {
 
 #define UDP_RECEIVER_OUTPUTS                                                                                           \
     {.name = "dropped", .type = FL_UINT32, .width = 1, .summary = "datagrams lost while the queue was full"},          \
-        {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "datagrams of another length or sender"},        \
+        {.name = "refused",                                                                                            \
+         .type = FL_UINT32,                                                                                            \
+         .width = 1,                                                                                                   \
+         .flags = FL_REFUSALS,                                                                                         \
+         .summary = "datagrams of another length or sender"},                                                          \
         {.name = "sender",                                                                                             \
          .type = FL_UINT32,                                                                                            \
          .width = 1,                                                                                                   \

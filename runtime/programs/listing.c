@@ -96,6 +96,7 @@ static void write_ports(const char *title, const struct fl_port *ports, uint32_t
         json_member("summary", ports[i].summary, out);
         write_flag("optional", ports[i].flags & FL_OPTIONAL, out);
         write_flag("delayed", ports[i].flags & FL_DELAYED, out);
+        write_flag("refusals", ports[i].flags & FL_REFUSALS, out);
         fputc('}', out);
     }
     fputc(']', out);

@@ -330,14 +330,19 @@ def test_a_task_says_how_it_does(start: Start) -> None:
     assert 0 <= told["last_overrun"]["step"] < told["steps"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.sendto(b"1", address)
+        one.sendto(b"of another length", address)
     while not (sensor := running.told()["sensors"]["heard"])["flag"]:
         assert time.monotonic() < end
     assert 0 <= sensor["age_s"] < SECONDS
+    while not (refused := running.told()["refused"]):
+        assert time.monotonic() < end
+    assert refused == {"heard": {"refused": 1}}
     lines = running.status("--status").stdout
     assert re.search(
         r"^overruns: \d+, \d+ releases skipped; the last [\d.]+ s ago: step \d+ ended [\d.]+ s late$", lines, re.M
     )
     assert re.search(r"^heard: flag 1, age [\d.]+ s$", lines, re.M)
+    assert lines.endswith("\nrefused by heard: 1 refused\n")
 
 
 def test_a_wrong_wish_for_status_is_said(start: Start) -> None:

@@ -29,7 +29,11 @@ static const struct fl_parameter parameters[] = {
 static const struct fl_port outputs[] = {
     FL_SENSOR_OUTPUTS,
     {.name = "dropped", .type = FL_UINT32, .width = 1, .summary = "messages missing in the sender's count"},
-    {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "messages of another type or width"},
+    {.name = "refused",
+     .type = FL_UINT32,
+     .width = 1,
+     .flags = FL_REFUSALS,
+     .summary = "messages of another type or width"},
 };
 
 enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, DATA };

@@ -41,10 +41,15 @@ static const struct fl_parameter parameters[] = {
 static const struct fl_port outputs[] = {
     FL_SENSOR_OUTPUTS,
     UDP_RECEIVER_OUTPUTS,
-    {.name = "forged", .type = FL_UINT32, .width = 1, .summary = "datagrams that no key of `keys` proves"},
+    {.name = "forged",
+     .type = FL_UINT32,
+     .width = 1,
+     .flags = FL_REFUSALS,
+     .summary = "datagrams that no key of `keys` proves"},
     {.name = "replayed",
      .type = FL_UINT32,
      .width = 1,
+     .flags = FL_REFUSALS,
      .summary = "datagrams that came again or late, or came before their sender proved them new"},
 };
 

@@ -7,7 +7,8 @@
  * While `withhold` is 1 the block is silent, so that receivers fail over.
  *
  * With `keys` each message carries 40 bytes more, which prove to its receiver that it is from here and new. A receiver
- * takes messages from the second on: to the first it answers with what the next ones have to repeat.
+ * takes messages from the second on: to the first it answers with what the next ones have to repeat. Answers that are
+ * not the receiver's are not taken, and counted in `forged`, at most four for each address in a step that sends.
  */
 #define _GNU_SOURCE
 #include "core/udp.h"
@@ -56,10 +57,15 @@ static const struct fl_port outputs[] = {
      .type = FL_UINT32,
      .width = 1,
      .summary = "datagrams the network did not take: not there, no route, or full"},
+    {.name = "forged",
+     .type = FL_UINT32,
+     .width = 1,
+     .flags = FL_REFUSALS,
+     .summary = "answers that no key of `keys` proves"},
 };
 
 enum { WITHHOLD, SEQUENCE, DATA };
-enum { SENT, FAILED };
+enum { SENT, FAILED, FORGED };
 
 /* One socket for each address: datagrams that wait for the hardware address of a missing computer fill their socket. */
 struct state {
@@ -152,14 +158,16 @@ static int start(struct fl_block *block)
     return udp_sockets_open(&state->sockets, block, udp->address.count, local, 0, udp->interface);
 }
 
-/* Take what the receiver wants to be answered; of what others send, a few each step. */
-static void take_challenges(int fd, struct authentication_sender *authentication)
+/* Take what the receiver wants to be answered; of what others send, a few each step. How many of these are forged. */
+static uint32_t take_challenges(int fd, struct authentication_sender *authentication)
 {
     enum { MOST = 4 };
     uint8_t bytes[AUTHENTICATION_CHALLENGE + 1];
     ssize_t got;
+    uint32_t forged = 0;
     for (int i = 0; i < MOST && (got = recv(fd, bytes, sizeof bytes, MSG_DONTWAIT)) >= 0; i++)
-        authentication_challenged(authentication, bytes, (size_t)got);
+        forged += authentication_challenged(authentication, bytes, (size_t)got) == AUTHENTICATION_FORGED;
+    return forged;
 }
 
 static ssize_t send_to(struct fl_block *block, size_t i)
@@ -169,7 +177,7 @@ static ssize_t send_to(struct fl_block *block, size_t i)
     const void *bytes = block->in[DATA];
     size_t length = (size_t)udp->length;
     if (state->message) {
-        take_challenges(state->sockets.fd[i], &state->authentication[i]);
+        FL_OUT(block, FORGED, uint32_t) += take_challenges(state->sockets.fd[i], &state->authentication[i]);
         authentication_sign(&state->authentication[i], state->message, length);
         bytes = state->message;
         length += AUTHENTICATION_TRAILER;

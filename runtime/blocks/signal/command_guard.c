@@ -51,7 +51,11 @@ static const struct fl_port outputs[] = {
     {.name = "operator", .type = FL_UINT32, .width = 1, .summary = "whose command it is; 0: there was none yet"},
     {.name = "other", .type = FL_UINT32, .width = 1, .summary = "in a conflict the other one; else 0"},
     {.name = "conflict", .type = FL_BOOLEAN, .width = 1, .summary = "1: several operators speak"},
-    {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "datagrams that were not fresh"},
+    {.name = "refused",
+     .type = FL_UINT32,
+     .width = 1,
+     .flags = FL_REFUSALS,
+     .summary = "datagrams that were not fresh"},
 };
 
 enum { OPERATORS = 8, TRUSTED = 2 };

@@ -27,7 +27,7 @@ static enum authentication_verdict judge(struct message message)
     return authentication_judge(&receiver, message.bytes, LENGTH, message.bytes + LENGTH, challenge);
 }
 
-static bool answer(void)
+static enum authentication_verdict answer(void)
 {
     return authentication_challenged(&sender, challenge, sizeof challenge);
 }
@@ -45,7 +45,7 @@ static int meet(void **state)
 {
     begin(state);
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
-    assert_true(answer());
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
     assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
     return 0;
 }
@@ -55,8 +55,8 @@ static void takes_what_answers(void **state)
     (void)state;
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
     struct message unanswered = next();
-    assert_true(answer());
-    assert_false(answer()); /* once */
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
+    assert_int_equal(answer(), AUTHENTICATION_REPLAYED); /* once */
     for (int i = 0; i < 100; i++)
         assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
     assert_int_equal(judge(unanswered), AUTHENTICATION_REPLAYED);
@@ -103,7 +103,7 @@ static void begin_another_session(void)
 {
     authentication_sender_begin(&sender, key, PORT);
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
-    assert_true(answer());
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
     assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
 }
 
@@ -118,7 +118,7 @@ static void refuses_an_earlier_session(void **state)
         begin_another_session();
         for (int i = 0; i < 3; i++) {
             assert_int_equal(judge(recorded[i]), AUTHENTICATION_UNANSWERED);
-            assert_false(answer()); /* it is not of this session */
+            assert_int_equal(answer(), AUTHENTICATION_REPLAYED); /* it is not of this session */
             assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
         }
     }
@@ -133,7 +133,7 @@ static void refuses_what_an_earlier_receiver_took(void **state)
     assert_int_equal(judge(recorded), AUTHENTICATION_UNANSWERED);
     struct message lost = next();
     assert_int_equal(judge(lost), AUTHENTICATION_UNANSWERED);
-    assert_true(answer());
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
     assert_int_equal(judge(recorded), AUTHENTICATION_UNANSWERED);
     assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
     assert_int_equal(judge(recorded), AUTHENTICATION_REPLAYED);
@@ -147,11 +147,11 @@ static void an_old_challenge_changes_nothing(void **state)
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
     uint8_t recorded[AUTHENTICATION_CHALLENGE];
     memcpy(recorded, challenge, sizeof recorded);
-    assert_true(answer());
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
     authentication_receiver_begin(&receiver, key, PORT);
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
-    assert_true(answer());
-    assert_false(authentication_challenged(&sender, recorded, sizeof recorded));
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
+    assert_int_equal(authentication_challenged(&sender, recorded, sizeof recorded), AUTHENTICATION_REPLAYED);
     assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
 }
 
@@ -161,13 +161,13 @@ static void refuses_each_flipped_bit_of_a_challenge(void **state)
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
     for (size_t bit = 0; bit < 8 * sizeof challenge; bit++) {
         challenge[bit / 8] ^= (uint8_t)(1U << bit % 8);
-        if (answer())
+        if (answer() != AUTHENTICATION_FORGED)
             fail_msg("bit %zu", bit);
         challenge[bit / 8] ^= (uint8_t)(1U << bit % 8);
     }
-    for (size_t length = 0; length < sizeof challenge; length++)
-        assert_false(authentication_challenged(&sender, challenge, length));
-    assert_true(answer());
+    for (size_t length = 0; length <= sizeof challenge + 1; length += length == sizeof challenge - 1 ? 2 : 1)
+        assert_int_equal(authentication_challenged(&sender, challenge, length), AUTHENTICATION_FORGED);
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
 }
 
 /* A message reflected to its sender is none to it, even where both directions had one key. */
@@ -175,7 +175,8 @@ static void a_message_is_no_challenge(void **state)
 {
     (void)state;
     struct message message = next();
-    assert_false(authentication_challenged(&sender, message.bytes + LENGTH, AUTHENTICATION_TRAILER));
+    assert_int_equal(authentication_challenged(&sender, message.bytes + LENGTH, AUTHENTICATION_TRAILER),
+                     AUTHENTICATION_FORGED);
 }
 
 /* Counters of one session would repeat its nonces. */
@@ -187,7 +188,7 @@ static void a_session_ends(void **state)
     assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
     assert_int_equal(judge(next()), AUTHENTICATION_UNANSWERED);
     assert_true(sender.session != before);
-    assert_true(answer());
+    assert_int_equal(answer(), AUTHENTICATION_GOOD);
     assert_int_equal(judge(next()), AUTHENTICATION_GOOD);
 }
 
