@@ -9,7 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Generator, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from flotilla.common.errors import UserError
@@ -39,6 +39,9 @@ class TaskStatus:
     """Of them, those since it was asked before."""
     flags: dict[str, bool]
     """Of its sensors."""
+    refused: dict[str, dict[str, int]] = field(default_factory=dict)
+    """By block and kind, how many messages it refused since it was started. A robot with an older release does not say
+    so."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,10 @@ def _status_of(report: dict[str, Any], past: TaskStatus | None) -> TaskStatus:
         overruns=overruns,
         lately=overruns - (counted if counted <= overruns else 0),  # it was started anew
         flags={name: bool(sensor["flag"]) for name, sensor in report["sensors"].items()},
+        refused={
+            block: {kind: int(count) for kind, count in kinds.items()}
+            for block, kinds in report.get("refused", {}).items()
+        },
     )
 
 

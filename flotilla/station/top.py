@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from flotilla.common.signals import size
 from flotilla.station.dialog import Dialog, TaskOf
 from flotilla.station.receiver import Receiver
 from flotilla.station.recording import Value
-from flotilla.station.services import State
+from flotilla.station.services import State, TaskStatus
 from flotilla.station.telemetry import Stream
 
 WINDOW_NS = 2_000_000_000
@@ -219,10 +219,14 @@ class Top:
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 1, 0, 0))
         for title in (*_TITLES, *_ASKED) if self._states else _TITLES:
             table.add_column(title, justify="left" if title in _LEFT else "right")
-        notes = []
+        notes = [
+            f"{robot}: {task} refused: {_refused(state.status)}"
+            for (robot, task), state in self._states.items()
+            if state.status and state.status.refused
+        ]
         for stream in self._known:
             row, count = self._stats[stream.topic].row(now_ns), self._receiver.counts[stream.topic]
-            if row.refusals:
+            if row.refusals and not _says(self._states.get((stream.robot, stream.task)), row.attempts):
                 notes.append(f"{stream.robot}: {stream.task} refused messages: {row.refusals}")
             silent = row.silent(stream)
             sent = count.received + (row.lost or 0)
@@ -259,6 +263,20 @@ class Top:
 
 def _marked(text: str, bad: bool) -> Text:
     return Text(text, style="bold red" if bad else "")
+
+
+def _refused(status: TaskStatus) -> str:
+    """`410 forged, 206 replayed by wrench; 3 forged by state`."""
+    return "; ".join(
+        ", ".join(f"{count} {kind}" for kind, count in kinds.items()) + f" by {block}"
+        for block, kinds in status.refused.items()
+    )
+
+
+def _says(state: State | None, kinds: Iterable[str]) -> bool:
+    """Whether the task says itself that it refused something of each of these kinds."""
+    counted = state.status.refused.values() if state and state.status else ()
+    return all(any(kind in each for each in counted) for kind in kinds)
 
 
 def _asked(state: State | None) -> list[Text]:

@@ -102,6 +102,19 @@ def test_what_tasks_say_of_themselves(robot: Path) -> None:
         assert any(a.tasks["valves"].status == status(3, 3) for a, _ in zip(answers, range(10000), strict=False))
 
 
+def test_what_a_task_refused(robot: Path) -> None:
+    """One with an older release says nothing of it. Seen to fail without it, and where the key has to be there."""
+    say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
+    refused = {"wrench": {"forged": 410, "replayed": 206}}
+    report = {"task": "valves", "period_s": 0.01, "overruns": 0, "sensors": {}, "refused": refused}
+    tell(robot, valves=0, sensors=0)
+    (robot / "valves").write_text(json.dumps(report) + "\n")
+    with closing(ask(ROBOT)) as answers:
+        tasks = next(answers).tasks
+    assert tasks["valves"].status == TaskStatus(0.01, 0, 0, {}, refused)
+    assert tasks["sensors"].status == TaskStatus(0.01, 0, 0, {"gyro": False}, {})
+
+
 @pytest.mark.parametrize(
     ("written", "said"),
     [

@@ -154,6 +154,49 @@ def test_what_else_a_robot_says_is_below_the_table() -> None:
     assert said[-1].strip() == "robot3: firewall dropped 7 packets of a flood"
 
 
+def test_what_any_task_refused_is_named() -> None:
+    """By block, without a stream too. Seen to fail without tasks that have no stream, and without the blocks."""
+    by_block = {"wrench": {"forged": 410, "replayed": 206}, "state": {"forged": 3}}
+    states = {
+        ("robot1", "valves"): State("running 5 s", True, TaskStatus(0.01, 0, 0, {}, {"wrench": {"refused": 5}})),
+        ("robot4", "thruster-mapping"): State("running 5 s", True, TaskStatus(0.01, 0, 0, {}, by_block)),
+        ("robot4", "heading"): State("running 5 s", True, TaskStatus(0.01, 0, 0, {})),
+        ("robot5", "drive"): State("no answer", False),
+    }
+    top = Top(Receiver([STREAM]), states, clock=lambda: 0)
+    assert [line.strip() for line in top.end().splitlines() if "refused:" in line] == [
+        "robot1: valves refused: 5 refused by wrench",
+        "robot4: thruster-mapping refused: 410 forged, 206 replayed by wrench; 3 forged by state",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("refused", "said"),
+    [
+        ({"wrench": {"forged": 409}}, ["robot1: heading refused: 409 forged by wrench"]),
+        ({}, ["robot1: heading refused messages: 410 forged"]),
+        (
+            {"wrench": {"replayed": 1}},
+            ["robot1: heading refused: 1 replayed by wrench", "robot1: heading refused messages: 410 forged"],
+        ),
+        (None, ["robot1: heading refused messages: 410 forged"]),
+    ],
+)
+def test_what_a_task_and_its_stream_say_is_said_once(
+    refused: dict[str, dict[str, int]] | None, said: list[str]
+) -> None:
+    """The task's own words come first, unless they lack a kind. Seen to fail with both, and with one alone."""
+    message = reporting(100, 1, forged=Signal(type="uint32")).messages["heading-power"]
+    fleet = reporting(100, 1).model_copy(
+        update={"messages": {"heading-power": message.model_copy(update={"attempts": ["forged"]})}}
+    )
+    (stream,) = streams(fleet)
+    status = None if refused is None else TaskStatus(0.01, 0, 0, {}, refused)
+    top = Top(Receiver([stream]), {("robot1", "heading"): State("running 5 s", True, status)}, clock=lambda: 0)
+    top.take(stream, {"forged": 410}, 0)
+    assert [line.strip() for line in top.end().splitlines() if "heading refused" in line] == said
+
+
 def test_the_rate_is_the_message_s() -> None:
     one = Signal(type="double", unit=["1"])
     (stream,) = streams(reporting(100, 4, left=one))
