@@ -41,7 +41,7 @@ static const struct fl_port outputs[] = {
      .unit = "ns",
      .summary = "in the header, since 1970-01-01 UTC; 0 for a type without header"},
     DDS_RECEIVER_PEERS,
-    {.name = "refused", .type = FL_UINT32, .width = 1, .flags = FL_REFUSALS, .summary = "messages that were left out"},
+    {.name = "refused", .type = FL_UINT32, .width = 1, .summary = "messages that were left out"},
     FL_SENSOR_OUTPUTS,
 };
 
