@@ -60,6 +60,8 @@ class Flight:
     """What a second station received of the steps; empty where there was none."""
     one_clock: bool = True
     """Whether stamps of different computers may be compared, as in virtual time."""
+    refused: dict[str, dict[str, dict[str, int]]] = field(default_factory=dict)
+    """What tasks had refused at their end, by task, block and kind; empty where they were not asked."""
 
     @classmethod
     def read(cls, directory: Path) -> Flight:
@@ -71,6 +73,9 @@ class Flight:
             {path.parent.name: json.loads(path.read_text()) for path in sorted(directory.glob("*/statistics.json"))},
             json.loads((directory / "events.json").read_text()),
             records(directory / "second", "steps") if (directory / "second").exists() else [],
+            refused={
+                path.parent.name: json.loads(path.read_text())["refused"] for path in directory.glob("*/status.json")
+            },
         )
 
     @cached_property

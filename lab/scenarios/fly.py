@@ -97,6 +97,7 @@ def start(task: dict[str, str], out: Path) -> subprocess.Popen[bytes]:
     """One control task, in its computer's namespace, as its unit would start it."""
     out.mkdir(parents=True)
     argv = ["ip", "netns", "exec", task["computer"], "flotilla-run", "--statistics", str(out / "statistics.json")]
+    argv += ["--control", str(out / "control")]
     if "blocks" in task:
         argv += ["--blocks", task["blocks"]]
     environment = dict(os.environ)
@@ -114,6 +115,7 @@ class Flight:
     def __init__(self, tasks: list[dict[str, str]], out: Path) -> None:
         self.tasks, self.out = tasks, out
         self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.out_of: dict[str, Path] = {}
         self.spawned: list[subprocess.Popen[bytes]] = []
         self.actions: dict[str, Callable[..., None]] = {
             "run": run,
@@ -126,7 +128,8 @@ class Flight:
             self.start(task)
 
     def start(self, task: dict[str, str], again: str = "") -> None:
-        self.running[task["name"]] = start(task, self.out / (task["name"] + again))
+        self.out_of[task["name"]] = self.out / (task["name"] + again)
+        self.running[task["name"]] = start(task, self.out_of[task["name"]])
 
     def power_off(self, computer: str) -> None:
         """Its tasks stop at any instruction, and its radio is silent."""
@@ -153,8 +156,12 @@ class Flight:
         self.running.pop(task).wait(_END_S)
 
     def end(self) -> dict[str, int]:
-        """The status of each task, which was asked to end, and of what was spawned."""
+        """The exit status of each task, which was asked how it does and to end, and of what was spawned."""
         statuses = {str(spawned.args): spawned.wait(_END_S) for spawned in self.spawned}
+        for name in self.running:
+            out = self.out_of[name]
+            argv = ["flotilla-param", "--control", str(out / "control"), "--status=json", name]
+            (out / "status.json").write_bytes(subprocess.run(argv, check=True, stdout=subprocess.PIPE).stdout)
         for task in self.running.values():
             task.send_signal(signal.SIGTERM)
         return statuses | {name: task.wait(_END_S) for name, task in self.running.items()}

@@ -2,8 +2,8 @@
 
 `python3 stranger.py SECONDS ADDRESS:PORT:LENGTH…` sends to each, once in a control period, from its own address,
 something of the right length or not. It also listens to all frames of the cell. What a control task got it sends once
-more, as recorded, altered, and as noise, with the address of the robot that sent it, to one task after the other. It
-ends when the time is over.
+more, as recorded, altered, and as noise, with the address of the robot that sent it, to one task after the other; and
+back to that robot, as if from the one that got it. It ends when the time is over.
 """
 
 from __future__ import annotations
@@ -48,15 +48,21 @@ def receiver_of(packet: bytes) -> Receiver:
     return socket.inet_ntoa(packet[16:20]), int.from_bytes(packet[22:24], "big")
 
 
-def forgeries(packet: bytes) -> tuple[bytes, bytes, bytes]:
-    """What somebody makes of a recorded message who has no key: the same, altered by a bit, noise."""
+def reflected(packet: bytes) -> bytes:
+    """To who sent it, from who got it; checksums stay right."""
+    source, target = packet[12:16], packet[16:20]
+    return packet[:12] + target + source + packet[22:24] + packet[20:22] + packet[24:]
+
+
+def forgeries(packet: bytes) -> tuple[bytes, ...]:
+    """What somebody makes of a recorded message who has no key: the same, altered by a bit, noise, reflected."""
     payload = _IP_HEADER + _UDP_HEADER
     altered = bytearray(packet)
     altered[payload] ^= 1
     altered[_CHECKSUM : _CHECKSUM + 2] = bytes(2)  # there is none, which IPv4 allows
     noise = bytearray(altered)
     noise[payload:] = random.Random(len(packet)).randbytes(len(packet) - payload)
-    return packet, bytes(altered), bytes(noise)
+    return packet, bytes(altered), bytes(noise), reflected(packet)
 
 
 def own_address(towards: Receiver) -> str:
@@ -120,7 +126,7 @@ def main(seconds: float, targets: list[str]) -> None:
             sender.sendto(next(content), receiver)
         receiver, _ = receivers[period % len(receivers)]
         for packet in listener.made.get(receiver, ()):
-            forger.sendto(packet, (receiver[0], 0))
+            forger.sendto(packet, (receiver_of(packet)[0], 0))
         time.sleep(max(0.0, due - time.monotonic()))
 
 

@@ -314,6 +314,22 @@ def test_forged_and_replayed_commands_are_refused_and_counted(flights: Callable[
     assert len(replayed) == 1, "more than the first messages of all, before the robots knew each other"
 
 
+def test_reflected_messages_are_refused_and_counted(flights: Callable[[str], Flight]) -> None:
+    """Each sender's messages come back to it as if from who got them."""
+
+    def came_back(flight: Flight) -> dict[str, int]:
+        blocks = {task: flight.refused[task] for task in ("sensors", "navigation", "control", "thruster-mapping")}
+        return {
+            task: sum(kinds.get("forged", 0) for name, kinds in refused.items() if name.startswith("to_"))
+            for task, refused in blocks.items()
+        }
+
+    flight = flights("strangers")
+    print(f"came back {came_back(flight)} in {len(flight.steps)} steps")
+    assert all(count > 0.1 * len(flight.steps) for count in came_back(flight).values())
+    assert set(came_back(flights("udp")).values()) == {0}
+
+
 def test_a_second_station_hears_the_same_and_disturbs_nobody(flights: Callable[[str], Flight]) -> None:
     """Its positions are a metre off, and the square is flown all the same; it goes on when the first one is gone."""
     flight = flights("strangers")
