@@ -4,6 +4,7 @@ connection that stays."""
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import subprocess
 import threading
@@ -24,6 +25,8 @@ _CELL = "/run/flotilla/cell"
 _IN_THE_CELL = "in the cell"
 _FLOOD = "nft --json list chain inet flotilla flood"
 """What the robot's firewall dropped as too many; /etc/nftables.conf."""
+_TIME = "echo $(chronyc -n ntpdata 2>/dev/null | grep RX)"
+"""Answers of time servers: how many came, and how many were valid."""
 _PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
 _SETTINGS = ("ConnectTimeout=5", "ServerAliveInterval=5", "ServerAliveCountMax=2")
 
@@ -64,16 +67,16 @@ class Answer:
     """By name."""
     notes: tuple[str, ...] = ()
     """What else is to be said of it: how often it lost its place in the ad hoc cell, and why; what its firewall dropped
-    as a flood."""
+    as a flood; answers that were no time server's."""
 
 
 def ask(robot: Robot) -> Generator[Answer, None, None]:
     """What it says, again and again, until UserError says why it does not answer any more."""
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
-    longest = 3 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
+    longest = 4 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
     status = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
-    notes = f"cat {_CELL} 2>/dev/null || echo; {_FLOOD} 2>/dev/null || echo null"
+    notes = f"cat {_CELL} 2>/dev/null || echo; {_FLOOD} 2>/dev/null || echo null; {_TIME}"
     script = f"while cat /proc/uptime && {show} && {{ {status}; {notes}; }} && echo {_END}; do sleep {ASK_S}; done"
     before: dict[str, State] = {}
     program, *way = ssh.command(robot)
@@ -90,9 +93,9 @@ def ask(robot: Robot) -> Generator[Answer, None, None]:
                     lines.append(line)
                     continue
                 try:
-                    *lines, cell, flood = lines
+                    *lines, cell, flood, clock = lines
                     before = _states(lines[: -len(units)], lines[-len(units) :], before)
-                    yield Answer(before, tuple(_notes(cell.strip(), json.loads(flood))))
+                    yield Answer(before, tuple(_notes(cell.strip(), json.loads(flood), clock)))
                 except (ValueError, KeyError, TypeError) as error:
                     raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {error!r}") from error
                 lines = []
@@ -101,13 +104,16 @@ def ask(robot: Robot) -> Generator[Answer, None, None]:
             process.kill()
 
 
-def _notes(cell: str, flood: dict[str, Any] | None) -> Iterator[str]:
-    """`flood`: a chain as libnftables-json(5) describes it; None: the robot has none."""
+def _notes(cell: str, flood: dict[str, Any] | None, clock: str) -> Iterator[str]:
+    """`flood`: a chain as libnftables-json(5) describes it; None: the robot has none. `clock`: of all time servers."""
     if cell not in ("", _IN_THE_CELL):
         yield f"radio {cell}"
     rules = [each["rule"]["expr"] for each in flood["nftables"] if "rule" in each] if flood else []
     if packets := sum(part["counter"]["packets"] for rule in rules for part in rule if "counter" in part):
         yield f"firewall dropped {packets} packets of a flood"
+    came, valid = (sum(map(int, re.findall(rf"{name} *: (\d+)", clock))) for name in ("Total RX", "Total valid RX"))
+    if came > valid:
+        yield f"clock refused {came - valid} answers that were not a time server's"
 
 
 def _states(lines: list[str], reported: list[str], before: dict[str, State]) -> dict[str, State]:

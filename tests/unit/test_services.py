@@ -160,6 +160,21 @@ def test_what_the_firewall_dropped(robot: Path, packets: int, said: tuple[str, .
     assert (first.notes, sorted(first.tasks)) == (said, ["sensors", "valves"])
 
 
+@pytest.mark.parametrize(
+    ("valid", "said"), [(7, ("clock refused 2 answers that were not a time server's",)), (9, ())], ids=["liar", "none"]
+)
+def test_what_told_a_wrong_time(robot: Path, valid: int, said: tuple[str, ...]) -> None:
+    """As chronyc 4.3 says it of two servers. Seen to fail with the first one's counts alone."""
+    say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
+    tell(robot, valves=7, sensors=0)
+    server = "RX timestamping : Kernel\nTotal TX        : 12\nTotal RX        : {}\nTotal valid RX  : {}\n"
+    counts = server.format(40, 40) + "\n" + server.format(9, valid)
+    program(robot, "chronyc", f"""#!/bin/sh\n[ "$*" = "-n ntpdata" ] && echo '{counts}'\n""")
+    with closing(ask(ROBOT)) as answers:
+        first = next(answers)
+    assert (first.notes, sorted(first.tasks)) == (said, ["sensors", "valves"])
+
+
 def until(answers: Iterator[Answer], wanted: dict[str, State]) -> bool:
     """One of the next answers is that: some were given before the change."""
     return any(answer.tasks == wanted for answer, _ in zip(answers, range(10000), strict=False))
