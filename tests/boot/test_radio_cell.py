@@ -179,7 +179,8 @@ def test_make_top_names_it(lab: GuestFleet, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(ssh, "command", lambda _: shell.command)
     with closing(services.ask(robot)) as answers:
         answer = next(answers)
-    assert answer.cell == "in the cell; joined again 3 times, last because it was on another channel, 2437 MHz"
+    lost = "in the cell; joined again 3 times, last because it was on another channel, 2437 MHz"
+    assert answer.notes == (f"radio {lost}",)
     assert answer.tasks["navigation"].good
 
 

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
+
+import pytest
 
 from flotilla.fleet import identity, message_keys
 from flotilla.fleet.model import Fleet
+from flotilla.robot import ssh
+from flotilla.station import services
 from tests.boot.guests import call, sh
 from tests.boot.shared.probes import firewall, time_server
 from tests.conftest import RobotGuest
@@ -44,8 +49,11 @@ def test_firewall_admits_the_fleet_alone(robot: RobotGuest, fleet: Fleet) -> Non
     assert set(opened["outside"]) == everything, f"with an open firewall only {opened} came through: a blind probe"
 
 
-def test_nobody_without_the_key_tells_the_time(robot: RobotGuest, fleet: Fleet) -> None:
-    """By a neighbour with another robot's address. Seen to fail for a configuration whose servers have no key."""
+def test_nobody_without_the_key_tells_the_time(
+    robot: RobotGuest, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a neighbour with another robot's address; the station hears of it. Seen to fail for a configuration whose
+    servers have no key."""
     other = next(each for each in fleet.robots.values() if each != robot.robot)
     key = message_keys.read().time(robot.robot, other)
     found = call(robot, time_server, str(other.address), str(robot.robot.address), f"{key}\n", timeout=2400)
@@ -54,3 +62,8 @@ def test_nobody_without_the_key_tells_the_time(robot: RobotGuest, fleet: Fleet) 
         assert answers >= time_server.ENOUGH
         assert taken == 0, f"{kind}: {taken} of {answers} taken"
     assert found["right"][1] >= time_server.ENOUGH
+    monkeypatch.setattr(ssh, "command", lambda _: robot.shell.command)
+    with closing(services.ask(robot.robot.model_copy(update={"control_tasks": ["any"]}))) as answers:
+        said = [re.fullmatch(r"clock refused (\d+) answers that .*", note) for note in next(answers).notes]
+    (refused,) = filter(None, said)
+    assert int(refused[1]) >= found["none"][0] + found["wrong"][0]
