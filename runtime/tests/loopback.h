@@ -8,6 +8,7 @@
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <sys/random.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
@@ -28,13 +29,24 @@ static inline uint16_t port_of(int fd)
     return ntohs(local.sin_port);
 }
 
-/* As a parameter; valid until the next call. */
+/* As a parameter; valid until the next call. Below those that the kernel deals out to sockets that ask for any (ip(7),
+ * ip_local_port_range), so that no other test gets it before it is used. */
 static inline const char *free_port(void)
 {
+    enum { FIRST = 20000, PORTS = 32768 - FIRST, ATTEMPTS = 100 };
     static char text[8];
-    int fd = bare("0.0.0.0", 0);
-    snprintf(text, sizeof text, "%u", port_of(fd));
-    close(fd);
+    struct sockaddr_in local = {.sin_family = AF_INET};
+    bool free = false;
+    for (int attempt = 0; attempt < ATTEMPTS && !free; attempt++) {
+        uint16_t drawn;
+        assert_int_equal(getrandom(&drawn, sizeof drawn, 0), sizeof drawn);
+        local.sin_port = htons((uint16_t)(FIRST + drawn % PORTS));
+        int fd = socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+        free = bind(fd, (struct sockaddr *)&local, sizeof local) == 0;
+        close(fd);
+    }
+    assert_true(free);
+    snprintf(text, sizeof text, "%u", ntohs(local.sin_port));
     return text;
 }
 
