@@ -10,7 +10,7 @@ import json
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,7 +106,8 @@ class Recording:
 
 
 class Desk:
-    """Of all browsers. `states`: of tasks, by robot and task, as Services keeps them; `replay`: instead of robots."""
+    """Of all browsers. `states` and `notes`: of tasks and of robots, as Services keeps them; `replay`: instead of
+    robots."""
 
     def __init__(
         self,
@@ -114,6 +115,7 @@ class Desk:
         receiver: Receiver,
         view: View,
         states: Mapping[tuple[str, str], State],
+        notes: Mapping[str, Sequence[str]],
         replay: Replay | None,
         driving: Driving,
     ) -> None:
@@ -126,6 +128,7 @@ class Desk:
         self._receiver = receiver
         self._view = view
         self._states = states
+        self._said = notes
         self._replay = replay
         self.recording = Recording(list(receiver.known.values()), self.note)
         self._open: dict[Session, _Open] = {}
@@ -188,6 +191,7 @@ class Desk:
         state = self._view.state() | {
             "type": "state",
             "tasks": {f"{robot} {task}": _task(state) for (robot, task), state in self._states.items()},
+            "said": {robot: list(notes) for robot, notes in self._said.items()},
             "driving": {robot: self._held(robot) for robot in self._vehicles},
             "recording": self.recording.state,
             "browsers": len(self._open),
@@ -479,5 +483,6 @@ def _task(state: State) -> dict[str, Any]:
         "overruns": status and status.overruns,
         "lately": status and status.lately,
         "sensors": status.flags if status else {},
+        "refusals": status.refusals if status else "",
         "period_ms": status and 1000 * status.period_s,
     }

@@ -8,7 +8,6 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Mapping
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from flotilla.station.desk import Desk
 from flotilla.station.driving import Driving
 from flotilla.station.receiver import REFRESH_S, Receiver, drain, listen
 from flotilla.station.replay import Replay
-from flotilla.station.services import Services, State
+from flotilla.station.services import Services
 from flotilla.station.telemetry import streams
 from flotilla.station.view import View
 from flotilla.station.web import Web
@@ -54,8 +53,8 @@ async def _serve(
         loop.add_signal_handler(number, ended.set)
     view = View(receiver, replay.clock if replay else time.time_ns)
     receiver.sinks.append(view)
-    states, trouble = ({}, "") if replay else _states(fleet)
-    desk = Desk(fleet, receiver, view, states, replay, driving)
+    services, trouble = (Services(()), "") if replay else _services(fleet)
+    desk = Desk(fleet, receiver, view, services.states, services.notes, replay, driving)
     receiver.sinks.append(desk.recording)
     sockets = [] if replay else listen((stream.port for stream in receiver.known.values()), arguments.address)
     for one in sockets:
@@ -99,12 +98,12 @@ async def _until(
             await asyncio.wait_for(ended.wait(), STATE_S)
 
 
-def _states(fleet: Fleet) -> tuple[Mapping[tuple[str, str], State], str]:
-    """Of tasks, asked by ssh, and why they are not asked, if they are not."""
+def _services(fleet: Fleet) -> tuple[Services, str]:
+    """Of the robots, asked by ssh, and why they are not asked, if they are not."""
     try:
-        return Services(fleet.robots.values()).states, ""
+        return Services(fleet.robots.values()), ""
     except UserError as error:
-        return {}, f"tasks are not asked: {error}"
+        return Services(()), f"tasks are not asked: {error}"
 
 
 def _address(text: str) -> str:

@@ -46,6 +46,14 @@ class TaskStatus:
     """By block and kind, how many messages it refused since it was started. A robot with an older release does not say
     so."""
 
+    @property
+    def refusals(self) -> str:
+        """`410 forged, 206 replayed by wrench; 3 forged by state`; empty: it refused nothing."""
+        return "; ".join(
+            ", ".join(f"{count} {kind}" for kind, count in kinds.items()) + f" by {block}"
+            for block, kinds in self.refused.items()
+        )
+
 
 @dataclass(frozen=True)
 class State:
@@ -161,7 +169,7 @@ class Services:
         asked = [robot for robot in robots if robot.control_tasks]
         self.states = {(robot.name, task): State("asked", True) for robot in asked for task in robot.control_tasks}
         """By robot and task, as they were reported last."""
-        self.notes: dict[str, tuple[str, ...]] = {}
+        self.notes: dict[str, tuple[str, ...]] = {robot.name: () for robot in asked}
         """By robot, what else is to be said of it."""
         for robot in asked:
             ssh.command(robot)

@@ -23,7 +23,7 @@ from flotilla.common.signals import size
 from flotilla.station.dialog import Dialog, TaskOf
 from flotilla.station.receiver import Receiver
 from flotilla.station.recording import Value
-from flotilla.station.services import State, TaskStatus
+from flotilla.station.services import State
 from flotilla.station.telemetry import Stream
 
 WINDOW_NS = 2_000_000_000
@@ -220,7 +220,7 @@ class Top:
         for title in (*_TITLES, *_ASKED) if self._states else _TITLES:
             table.add_column(title, justify="left" if title in _LEFT else "right")
         notes = [
-            f"{robot}: {task} refused: {_refused(state.status)}"
+            f"{robot}: {task} refused: {state.status.refusals}"
             for (robot, task), state in self._states.items()
             if state.status and state.status.refused
         ]
@@ -263,14 +263,6 @@ class Top:
 
 def _marked(text: str, bad: bool) -> Text:
     return Text(text, style="bold red" if bad else "")
-
-
-def _refused(status: TaskStatus) -> str:
-    """`410 forged, 206 replayed by wrench; 3 forged by state`."""
-    return "; ".join(
-        ", ".join(f"{count} {kind}" for kind, count in kinds.items()) + f" by {block}"
-        for block, kinds in status.refused.items()
-    )
 
 
 def _says(state: State | None, kinds: Iterable[str]) -> bool:

@@ -49,6 +49,15 @@ for unit in "$@"; do
 '
 done
 """
+PARAM = """#!/bin/sh
+[ "$1" = --status=json ] || exec {real} --control {control} "$@"
+{real} --control {control} "$@" |
+    sed 's/"task": "[a-z]*"/"task": "'$2'"/; s/"refused": {{}}/"refused": {{"commands": {{"forged": 410}}}}/'
+"""
+SCOPE = '#!/bin/sh\nexec {real} --control {control} "$@"\n'
+NFT = """#!/bin/sh
+echo '{"nftables": [{"rule": {"expr": [{"counter": {"packets": 14, "bytes": 9}}, {"drop": null}]}}]}'
+"""
 TAKEN = 12
 """Key presses whose latency is measured."""
 ALL_REQUESTS = 10_000
@@ -88,10 +97,10 @@ def there(flotilla_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
         "ssh": SSH.format(directory=directory),
         "sudo": '#!/bin/sh\nexec "$@"\n',
         "systemctl": SYSTEMCTL.format(directory=directory),
+        "nft": NFT,
     }
-    for program in ("flotilla-param", "flotilla-scope"):
-        real = flotilla_run.with_name(program)
-        scripts[program] = f'#!/bin/sh\nexec {real} --control {running.control} "$@"\n'
+    for program, script in (("flotilla-param", PARAM), ("flotilla-scope", SCOPE)):
+        scripts[program] = script.format(real=flotilla_run.with_name(program), control=running.control)
     for name, script in scripts.items():
         (directory / name).write_text(script)
         (directory / name).chmod(0o755)
@@ -160,6 +169,12 @@ def test_the_fleet_is_shown(page: Page, served: Station, robot: WheeledRobot, ar
         asked
     )
     assert page.value("location.search") == "", "the token stays in the address"
+
+
+def test_what_was_refused_is_shown(page: Page) -> None:
+    """By each task, and by the robot's firewall. Seen to fail without what the robot says beside its tasks."""
+    for words in ("drive refused 410 forged by commands", "firewall dropped 14 packets of a flood"):
+        page.until(f"document.querySelector('.robot .figures').textContent.includes('{words}')")
 
 
 def turning(robot: WheeledRobot, count: int) -> list[tuple[float, int, int, float, float, float, bool]]:

@@ -117,9 +117,14 @@ export class Fleet {
       parts.push(["overruns", `${overruns}${lately ? ` (+${lately})` : ""}`, lately > 0]);
     }
     // No alarm: each first message after a start is refused, too.
-    for (const stream of own) {
-      const { refusals } = state.streams[stream.topic];
-      if (refusals) parts.push([stream.task, `refused ${refusals}`, false]);
+    for (const name of new Set([...robot.tasks, ...own.map((stream) => stream.task)])) {
+      const reported = own.find((stream) => stream.task === name && state.streams[stream.topic].refusals);
+      const refusals = state.tasks[`${robot.name} ${name}`]?.refusals || (reported && state.streams[reported.topic].refusals);
+      if (refusals) parts.push([name, `refused ${refusals}`, false]);
+    }
+    for (const note of state.said[robot.name] ?? []) {
+      const [label, ...words] = note.split(" ");
+      parts.push([label, words.join(" "), true]);
     }
     const shown = parts.map((part) => part.join(" ")).join("|");
     if (card.figures.dataset.shown === shown) return;
