@@ -153,8 +153,8 @@ def test_what_the_firewall_dropped(robot: Path, packets: int, said: tuple[str, .
     """As nft 1.0.6 says it. Seen to fail without the chain in what is asked."""
     say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
     tell(robot, valves=7, sensors=0)
-    counter = CHAIN.replace("PACKETS", str(packets)).replace("\n", " ")
-    program(robot, "nft", f"""#!/bin/sh\n[ "$*" = "--json list chain inet flotilla flood" ] && echo '{counter}'\n""")
+    chain = CHAIN.replace("PACKETS", str(packets)).replace("\n", " ")
+    program(robot, "nft", f"""#!/bin/sh\n[ "$*" = "--json list chain inet flotilla flood" ] && echo '{chain}'\n""")
     with closing(ask(ROBOT)) as answers:
         first = next(answers)
     assert (first.notes, sorted(first.tasks)) == (said, ["sensors", "valves"])
