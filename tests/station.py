@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import os
@@ -11,6 +12,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +25,10 @@ from mcap.reader import NonSeekingReader, SeekingReader
 
 from flotilla.common import paths
 from flotilla.fleet import inventory
+from flotilla.fleet.message_keys import MessageKeys
+from flotilla.fleet.model import Fleet
 from flotilla.station import telemetry
+from flotilla.station.authentication import Signer
 from tests.running import PATIENCE
 
 FLEET = paths.PROJECT / "lab" / "scenarios" / "inventory"
@@ -38,6 +43,9 @@ ADDRESS = LOOPBACK + "254"
 
 STRANGER = LOOPBACK + "9"
 """No robot of that fleet."""
+
+SECRET = bytes([0x42] * 32)
+"""Of fleets in tests."""
 
 Messages = list[tuple[str, Any]]
 """Topic and decoded message."""
@@ -55,7 +63,7 @@ def on_loopback(directory: Path, begin: str = LOOPBACK, fleet: Path = FLEET) -> 
 def secret_in(directory: Path) -> dict[str, str]:
     """The environment of programs that have a fleet's secret: in this folder, which is made."""
     directory.mkdir(exist_ok=True)
-    (directory / "fleet_secret").write_text("42" * 32 + "\n")
+    (directory / "fleet_secret").write_text(SECRET.hex() + "\n")
     return {"KEYS": str(directory)}
 
 
@@ -68,12 +76,16 @@ def station(
     environment: Mapping[str, str] | None = None,
     address: str = ADDRESS,
 ) -> Iterator[subprocess.Popen[str]]:
-    """`flotilla COMMAND` with `options`, run by the command line `under`. `environment`: besides this one's."""
+    """`flotilla COMMAND` with `options`, run by the command line `under`, with the secret of fleets in tests.
+    `environment`: besides this one's."""
     argv = [*under, sys.executable, "-m", "flotilla", command, *options, "--inventory", fleet, "--address", address]
-    with subprocess.Popen(
-        argv, cwd=paths.PROJECT, env=os.environ | (environment or {}), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True,
-    ) as process:  # fmt: skip
+    with (
+        tempfile.TemporaryDirectory() as keys,
+        subprocess.Popen(
+            argv, cwd=paths.PROJECT, env=os.environ | secret_in(Path(keys)) | dict(environment or {}),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        ) as process,
+    ):  # fmt: skip
         try:
             yield process
         finally:
@@ -89,18 +101,66 @@ def message_class(name: str, descriptors: bytes) -> type[Any]:
     return found
 
 
+class ProvenWay:
+    """A stream's datagrams to its station, each with a proof."""
+
+    def __init__(self, stream: telemetry.Stream, fleet: Fleet, secret: bytes = SECRET) -> None:
+        robot = next(robot for robot in fleet.robots.values() if robot.name == stream.robot)
+        station = fleet.stations[0]
+        keys = MessageKeys(secret, {})
+        self.signer = Signer(keys.between(robot, station), stream.port)
+        self._to = (str(station.address), stream.port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((stream.address, 0))
+        self._socket.setblocking(False)
+
+    def send(self, payload: bytes) -> bytes:
+        """The message that was sent."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                with contextlib.suppress(ConnectionRefusedError):
+                    self.signer.challenged(self._socket.recv(100))
+        message = self.signer.sign(payload)
+        with contextlib.suppress(ConnectionRefusedError):
+            self._socket.sendto(message, self._to)
+        return message
+
+    def close(self) -> None:
+        self._socket.close()
+
+
 class Robots:
     """Send what the tasks `valves` and `control` would; numbers go up by one."""
 
-    def __init__(self, fleet: Path) -> None:
-        self.streams = {stream.task: stream for stream in telemetry.streams(inventory.load_fleet(fleet))}
+    def __init__(self, fleet: Path, secret: bytes = SECRET) -> None:
+        described = inventory.load_fleet(fleet)
+        self.streams = {stream.task: stream for stream in telemetry.streams(described)}
         self.sent = dict.fromkeys(self.streams, 0)
+        self._ways = {task: ProvenWay(stream, described, secret) for task, stream in self.streams.items()}
+        self._last: dict[str, bytes] = {}
 
-    def send(self, task: str, datagram: bytes | None = None, address: str = "") -> None:
+    def __enter__(self) -> Robots:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for way in self._ways.values():
+            way.close()
+
+    def send(self, task: str, payload: bytes | None = None) -> None:
+        """With the proof of the robot's task."""
         stream = self.streams[task]
-        if datagram is None:
-            datagram = struct.pack("<Q", self.sent[task]) + bytes(stream.length - 8)
+        if payload is None:
+            payload = struct.pack("<Q", self.sent[task]) + bytes(stream.length - 8)
             self.sent[task] += 1
+        self._last[task] = self._ways[task].send(payload)
+
+    def repeat(self, task: str) -> None:
+        """The last message."""
+        self.send_raw(task, self._last[task])
+
+    def send_raw(self, task: str, datagram: bytes, address: str = "") -> None:
+        """From the robot's address, or another one."""
+        stream = self.streams[task]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
             one.bind((address or stream.address, 0))
             one.sendto(datagram, (ADDRESS, stream.port))

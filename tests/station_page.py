@@ -25,6 +25,7 @@ from flotilla.station import telemetry
 from flotilla.station.driving import COMMAND
 from tests.browser import Page
 from tests.running import PATIENCE
+from tests.station import ProvenWay
 
 
 class Station:
@@ -106,7 +107,6 @@ class WheeledRobot:
     def __init__(self, fleet: Path) -> None:
         described = inventory.load_fleet(fleet)
         self.streams = {stream.task: stream for stream in telemetry.streams(described)}
-        self.station = str(described.stations[0].address)
         self.address = self.streams["drive"].address
         self.commands: list[tuple[float, int, int, float, float, float, bool]] = []
         """When it came, operator, sequence, v, omega, boom, enable."""
@@ -115,8 +115,7 @@ class WheeledRobot:
         self._end = threading.Event()
         self._command = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._command.bind((self.address, 5030))
-        self._report = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._report.bind((self.address, 0))
+        self._reports = {task: ProvenWay(stream, described) for task, stream in self.streams.items()}
         self._threads = [threading.Thread(target=each) for each in (self._listen, self._drive)]
         for thread in self._threads:
             thread.start()
@@ -128,7 +127,8 @@ class WheeledRobot:
         for thread in self._threads:
             thread.join()
         self._command.close()
-        self._report.close()
+        for report in self._reports.values():
+            report.close()
 
     @property
     def moves(self) -> bool:
@@ -183,7 +183,7 @@ class WheeledRobot:
         for each in stream.fields:
             value = values.get(each.name, 0)
             data += struct.pack(f"<{each.width}{CODES[each.type]}", *(value if isinstance(value, tuple) else (value,)))
-        self._report.sendto(data, (self.station, stream.port))
+        self._reports[task].send(data)
 
 
 def until(what: Callable[[], Any], why: str, timeout_s: float = PATIENCE) -> Any:

@@ -71,7 +71,7 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "revoked_keys": keys.revoked(),
         "host_public_key": host_keys[robot.name],
         "host_private_key": keys.of_robot(robot).read_text(),
-        "message_key": shared_keys.between,
+        "message_keys": shared_keys.lines(robot, hosts(fleet)),
         "time_key": shared_keys.time,
         "operator_key": keys.public(keys.operator()),
         "operator_authority": keys.public(operators.authority()),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +40,10 @@ class MessageKeys:
     def between(self, sender: Host, receiver: Host) -> str:
         """The key of messages from one computer to another, 64 hexadecimal digits."""
         return self.derived(f"messages from {self.identity(sender)} to {self.identity(receiver)}").hex()
+
+    def lines(self, host: Host, others: Iterable[Host]) -> str:
+        """Of a computer's file: address of another one, key of messages to it, key of messages from it."""
+        return "".join(f"{other.address} {self.between(host, other)} {self.between(other, host)}\n" for other in others)
 
     def time(self, one: Host, other: Host) -> str:
         """The key of NTP messages between two computers, either way: a line of chrony.keys(5), number, type and key."""

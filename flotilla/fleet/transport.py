@@ -80,7 +80,7 @@ class Hop:
             inputs["withhold"] = silent
         if message.receiver == STATIONS:
             to = {"address": addresses(self.fleet.stations), "port": message.port, "length": message.bytes}
-            return _block("udp-send", message.every, inputs, to)
+            return _block("udp-send", message.every, inputs, to | {"keys": CREDENTIAL})
         if network.transport == "dds":
             return _block("dds-publish", message.every, inputs, {**self._topic, "robot": self.robot.number})
         receivers = self.fleet.robots_with(message.receiver)

@@ -11,6 +11,7 @@ from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import STATIONS, Fleet
+from flotilla.station import station_keys
 from flotilla.station.dialog import Dialog, keyboard
 from flotilla.station.live import PORT, Server
 from flotilla.station.receiver import Receiver, listen, receive
@@ -38,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
     fleet = inventory.load_fleet(arguments.inventory)
     known = streams(fleet) if arguments.ask else known_to(fleet, arguments.inventory)
     sockets = listen((stream.port for stream in known), arguments.address)
-    receiver = Receiver(known)
+    receiver = Receiver(known, station_keys.of_telemetry(fleet))
     doing = []
     seconds = arguments.seconds
     keys = {}

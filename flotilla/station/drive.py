@@ -22,7 +22,7 @@ from rich.text import Text
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
-from flotilla.station import inputs
+from flotilla.station import inputs, station_keys
 from flotilla.station.driving import TASK, Driving, Motion, Operator, Refused, State
 from flotilla.station.inputs import Input
 from flotilla.station.receiver import Receiver, drain, listen
@@ -156,7 +156,7 @@ def run(arguments: argparse.Namespace) -> None:
         driving.take(robot.name, operator)
         if not known:
             raise UserError(f"{robot.name}: its task {TASK} reports to no station; describe one in the inventory")
-        receiver = Receiver(known)
+        receiver = Receiver(known, station_keys.of_telemetry(fleet))
         sockets = listen((stream.port for stream in known), arguments.address)
         with inputs.opened(arguments.input) as source:
             session = Session(driving, robot.name, operator, source)

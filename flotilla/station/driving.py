@@ -32,8 +32,9 @@ import yaml
 from flotilla.common import paths, signals
 from flotilla.common.errors import UserError
 from flotilla.common.yaml_file import did_you_mean
-from flotilla.fleet import identity, message_keys
+from flotilla.fleet import identity
 from flotilla.fleet.model import Fleet, Host, Robot
+from flotilla.station import station_keys
 from flotilla.station.authentication import Signer
 
 TASK = "drive"
@@ -412,14 +413,9 @@ def _vehicle(fleet: Fleet, robot: Robot) -> Vehicle:
 def _signer(fleet: Fleet, address: str, vehicle: Vehicle) -> Signer | None:
     if not vehicle.signed:
         return None
-    secret = message_keys.secret_file()
-    if not secret.exists():
-        raise UserError(
-            f"{paths.shown(secret)}: is missing, so {vehicle.robot} would take no command; bring it from where its "
-            "card was made, by `make backup-keys` and `make restore-keys`, or name the folder: KEYS="
-        )
+    keys = station_keys.shared(f"{vehicle.robot} would take no command")
     robot = next(each for each in fleet.robots.values() if each.name == vehicle.robot)
-    return Signer(message_keys.read().between(_station(fleet, vehicle, address), robot), vehicle.port)
+    return Signer(keys.between(_station(fleet, vehicle, address), robot), vehicle.port)
 
 
 def _station(fleet: Fleet, vehicle: Vehicle, address: str) -> Host:

@@ -15,6 +15,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
+from flotilla.station import station_keys
 from flotilla.station.desk import Desk
 from flotilla.station.driving import Driving
 from flotilla.station.receiver import REFRESH_S, Receiver, drain, listen
@@ -34,7 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
     address = _address(arguments.page_address)
     known = streams(fleet)
     replay = Replay(arguments.replay, known) if arguments.replay else None
-    receiver = Receiver(replay.streams if replay else known)
+    receiver = Receiver(replay.streams) if replay else Receiver(known, station_keys.of_telemetry(fleet))
     with Driving(fleet, arguments.address) as driving:
         asyncio.run(_serve(arguments, fleet, receiver, replay, driving, address))
 

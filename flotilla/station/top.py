@@ -228,6 +228,8 @@ class Top:
             row, count = self._stats[stream.topic].row(now_ns), self._receiver.counts[stream.topic]
             if row.refusals and not _says(self._states.get((stream.robot, stream.task)), row.attempts):
                 notes.append(f"{stream.robot}: {stream.task} refused messages: {row.refusals}")
+            if count.attempts:
+                notes.append(f"left out as {stream.robot}'s {stream.task} {stream.name}: {count.attempts}")
             silent = row.silent(stream)
             sent = count.received + (row.lost or 0)
             table.add_row(
@@ -238,7 +240,7 @@ class Top:
                 _marked(f"{row.rate_hz:.1f}", silent),
                 f"{stream.rate_hz:g}",
                 f"{count.received}",
-                _marked(f"{count.refused}", count.refused > 0),
+                _marked(f"{count.bad}", count.bad > 0),
                 "" if row.lost is None else _marked(f"{row.lost}", row.lost > 0),
                 "" if row.lost is None or not sent else f"{100 * row.lost / sent:.1f}",
                 "" if row.link is None else _marked(f"{100 * row.link:.0f}", row.link < _GOOD_LINK),

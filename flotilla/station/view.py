@@ -152,7 +152,7 @@ class View:
         values = self._last.get(stream.topic, {})
         return {
             "hz": round(row.rate_hz, 1), "lost": row.lost, "link": row.link, "age": row.age_s, "charge": row.charge,
-            "silent": row.silent(stream), "came": count.received, "refused": count.refused,
+            "silent": row.silent(stream), "came": count.received, "refused": count.bad,
             "bad": [name for name, share in row.flags.items() if name.endswith(HEALTH) and share < 1],
             "refusals": row.refusals,
             "values": {

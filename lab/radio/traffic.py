@@ -223,9 +223,10 @@ def _sent(
 
 def _positions(fleet: Fleet, rendered: Sequence[tuple[int, str, Any]]) -> Iterator[tuple[Flow, int]]:
     for robot, _, task in rendered:
-        for _ in _blocks(task, "igps"):
+        for _, parameters, _ in _blocks(task, "igps"):
             if fleet.stations:
-                flow = Flow("positions", len(fleet.robots), (robot,), UDP_BYTES + IGPS_BYTES)
+                packet = UDP_BYTES + IGPS_BYTES + (PROOF_BYTES if parameters.get("keys") else 0)
+                flow = Flow("positions", len(fleet.robots), (robot,), packet)
                 yield flow, round(transport.duration_s(task["period"]) * 1e9)
 
 

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from flotilla.fleet import identity
+from flotilla.fleet import identity, message_keys
 from flotilla.fleet.model import Board, Fleet, Host
 from lab.latency.results import Latency
 from lab.scenarios import virtual
@@ -67,7 +67,7 @@ def fleet(loop: int, robots: int, board: Board | None = None) -> Fleet:
     return described.model_copy(update={"robots": moved, "stations": [station]})
 
 
-def _loop(described: Fleet, loop: int, directory: str) -> tuple[list[dict[str, str]], dict[str, bytes]]:
+def _loop(described: Fleet, loop: int, directory: str, keys: Path) -> tuple[list[dict[str, str]], dict[str, bytes]]:
     """Tasks, and files by path."""
     changes = {
         "valves.relays.base": _RELAYS[loop],
@@ -82,13 +82,20 @@ def _loop(described: Fleet, loop: int, directory: str) -> tuple[list[dict[str, s
         }
         for robot in described.robots.values()
     }
-    there = {f"{directory}/station{loop}.yml": virtual.station(described)}
-    tasks = [{"name": f"{loop}/station", "computer": station.name, "file": f"{directory}/station{loop}.yml"}]
+    there = {f"{directory}/station{loop}.yml": virtual.station(described)} | {
+        f"{directory}/{host.name}/{message_keys.CREDENTIAL}": virtual.credentials(described, host, keys)
+        for host in (station, *described.robots.values())
+    }
+    files = [("station", station.name, f"{directory}/station{loop}.yml")]
     for robot in described.robots.values():
         for path, task in of_robots[robot.name].items():
             name = Path(path).stem
             there[f"{directory}/{loop}-{name}.yml"] = task
-            tasks.append({"name": f"{loop}/{name}", "computer": robot.name, "file": f"{directory}/{loop}-{name}.yml"})
+            files.append((name, robot.name, f"{directory}/{loop}-{name}.yml"))
+    tasks = [
+        {"name": f"{loop}/{name}", "computer": computer, "file": file, "credentials": f"{directory}/{computer}"}
+        for name, computer, file in files
+    ]
     return tasks, there
 
 
@@ -99,7 +106,7 @@ def files(robots: int, keys: Path, board: Board | None = None) -> dict[str, byte
     tasks: list[dict[str, str]] = []
     fleets = [fleet(loop, robots, board) for loop in range(math.ceil(robots / PER_LOOP))]
     for loop, described in enumerate(fleets):
-        its_tasks, its_files = _loop(described, loop, directory)
+        its_tasks, its_files = _loop(described, loop, directory, keys)
         tasks += its_tasks
         there |= its_files
     hosts: list[Host] = [host for described in fleets for host in (*described.robots.values(), *described.stations)]

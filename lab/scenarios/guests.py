@@ -18,9 +18,10 @@ from pathlib import Path
 from unittest import mock
 
 from flotilla.common import paths, progress
-from flotilla.fleet import identity
+from flotilla.fleet import identity, message_keys
 from flotilla.fleet.model import Board, Fleet
-from flotilla.station import receiver, telemetry
+from flotilla.station import receiver, station_keys, telemetry
+from flotilla.station.authentication import Signer
 from flotilla.station.recording import Value
 from images.builder import build
 from lab.emulators.dsp3000 import Dsp3000
@@ -128,7 +129,8 @@ class GuestFleet:
         self._igps = igps
         self._records: dict[str, list[Record]] = {}
         streams = [replace(stream, address=LOOPBACK) for stream in telemetry.streams(described)]
-        self._receiver = receiver.Receiver(streams)
+        key_of, station = station_keys.of_telemetry(described), str(described.stations[0].address)
+        self._receiver = receiver.Receiver(streams, lambda stream, _: key_of(stream, station))
         self._receiver.sinks.append(self)
         self._sockets = receiver.listen((stream.port for stream in streams), LOOPBACK)
 
@@ -265,7 +267,8 @@ def guest_fleet(
         machines[flying.name].prepare()
         stack.enter_context(SerialLine(Dsp3000(robot.gyro_deg_s, noise=0), UnixSocket(str(gyro))))
         there = (LOOPBACK, segment.udp_port(*receiver))
-        igps = stack.enter_context(Igps(there, robot.position, rate=100, faults=Faults(loss=1)))
+        signer = Signer(message_keys.read().between(described.stations[0], flying), IGPS_PORT)
+        igps = stack.enter_context(Igps(there, robot.position, rate=100, faults=Faults(loss=1), signer=signer))
         lab = GuestFleet(described, robot, igps, machines, shells, segment)
         stack.callback(lab.close)
         with progress.step(f"boot {len(robots)} guests") as step:

@@ -80,7 +80,8 @@ def members(plan: Plan, fleet: Fleet, board: Board, keys: Path) -> list[Member]:
             session = _session(plan, fleet, board, robot, (radios, count))
             files = common | {f"{DIRECTORY}/session.json": json.dumps(session, sort_keys=True).encode()}
             if robot is flying:
-                files |= _of_the_station(plan, fleet, board)
+                files |= virtual.lab_files(plan, fleet, board, keys, DIRECTORY)
+                files[f"{DIRECTORY}/plant/plant.so"] = runtime.compile_plugin(PLANT, board.system)
             nodes = [_changed(node, plan) for node in data_partition.nodes(fleet, robot)]
             found.append(Member(robot, tuple(range(radios, radios + count)), files, nodes))
             radios += count
@@ -111,14 +112,6 @@ def _session(plan: Plan, fleet: Fleet, board: Board, robot: Robot, radios: tuple
             "flight": {"name": plan.name, "seconds": plan.seconds, "tasks": tasks, "events": events},
         }
     return session
-
-
-def _of_the_station(plan: Plan, fleet: Fleet, board: Board) -> dict[str, bytes]:
-    return {
-        f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.system),
-        f"{DIRECTORY}/station.yml": virtual.station(fleet),
-        f"{DIRECTORY}/plant.yml": virtual.plant(plan, fleet, board),
-    }
 
 
 def _changed(node: Node, plan: Plan) -> Node:

@@ -159,6 +159,13 @@ def rendered(fleet: Fleet, keys: Path) -> dict[str, dict[str, bytes]]:
         }
 
 
+def credentials(fleet: Fleet, host: Host, keys: Path) -> bytes:
+    """The file with the keys of a computer's messages; they are made in `keys`."""
+    with mock.patch.object(paths, "KEYS", keys):
+        computable_keys.write()
+        return message_keys.read().lines(host, identity.hosts(fleet)).encode()
+
+
 def changed(name: str, content: bytes, changes: Mapping[str, object]) -> bytes:
     """A control task with the parameters of `changes` that are its own."""
     own = {key.split(".", 1)[1]: value for key, value in changes.items() if key.split(".")[0] == name}
@@ -176,7 +183,7 @@ def _own(template: str, **values: object) -> bytes:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HERE), undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    return environment.get_template(template).render(values).encode()
+    return environment.get_template(template).render(values, keys=message_keys.CREDENTIAL).encode()
 
 
 def station(described: Fleet) -> bytes:
@@ -196,16 +203,34 @@ def plant(plan: Plan, described: Fleet, board: Board) -> bytes:
 
 
 def lab_tasks(directory: Path | PurePosixPath) -> list[dict[str, str]]:
-    """Of station and plant, as fly.py starts them, whose files are in a directory."""
+    """Of station and plant, as fly.py starts them, whose files and `lab_files` are in a directory."""
+    own = {"computer": STATION, "credentials": f"{directory}/{STATION}"}
     return [
-        {"name": "station", "computer": STATION, "file": f"{directory}/station.yml"},
-        {"name": "plant", "computer": STATION, "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
+        own | {"name": "station", "file": f"{directory}/station.yml"},
+        own | {"name": "plant", "file": f"{directory}/plant.yml", "blocks": f"{DIRECTORY}/plant"},
     ]
 
 
+def lab_files(
+    plan: Plan, described: Fleet, board: Board, keys: Path, directory: Path | PurePosixPath
+) -> dict[str, bytes]:
+    """What `lab_tasks` need, by path."""
+    first = described.stations[0]
+    return {
+        f"{directory}/plant.yml": plant(plan, described, board),
+        f"{directory}/station.yml": station(described),
+        f"{directory}/{STATION}/{message_keys.CREDENTIAL}": credentials(described, first, keys),
+    }
+
+
 def _receivers(described: Fleet, brought: Mapping[str, Mapping[str, bytes]]) -> list[str]:
-    """Where control tasks receive datagrams, and of what length: `address:port:length`."""
-    return [
+    """Where computers receive datagrams, and of what length: `address:port:length`."""
+    heard = [
+        f"{station.address}:{stream.port}:{stream.length}"
+        for station in described.stations
+        for stream in telemetry.streams(described)
+    ]
+    return heard + [
         f"{robot.address}:{block['parameters']['port']}:{block['parameters'].get('length', IGPS_BYTES)}"
         for robot in described.robots.values()
         for name in robot.control_tasks
@@ -229,29 +254,29 @@ def _flight(plan: Plan, board: Board, keys: Path) -> tuple[dict[str, Any], dict[
     described = fleet(plan.transport, plan.standby, second_station=plan.second_station, board=board)
     flying = described.robot_with("valves")
     brought = rendered(described, keys)
-    there = {
-        f"{directory}/plant.yml": plant(plan, described, board),
-        f"{directory}/station.yml": station(described),
-    }
+    there = lab_files(plan, described, board, keys, directory)
     tasks = lab_tasks(directory)
     if plan.second_station:
         # A file is its task's lock: two computers of one guest need two.
         there[f"{directory}/{SECOND}.yml"] = there[f"{directory}/station.yml"]
         there[f"{directory}/{SECOND}-igps.yml"] = _own("second.yml.j2", robot_address=flying.address)
+        own = f"{directory}/{SECOND}"
+        there[f"{own}/{message_keys.CREDENTIAL}"] = credentials(described, second(described), keys)
         tasks += [
-            {"name": name, "computer": SECOND, "file": f"{directory}/{name}.yml"} for name in (SECOND, f"{SECOND}-igps")
+            {"name": name, "computer": SECOND, "file": f"{directory}/{name}.yml", "credentials": own}
+            for name in (SECOND, f"{SECOND}-igps")
         ]
     for robot in described.robots.values():
-        credentials = f"{directory}/{robot.name}"
+        its_keys = f"{directory}/{robot.name}"
         configuration = f"{directory}/{robot.name}-cyclonedds.xml"
-        own = {configuration: "cyclonedds.xml", f"{credentials}/{message_keys.CREDENTIAL}": message_keys.CREDENTIAL}
-        there |= {path: brought[robot.name][f"/etc/flotilla/{name}"] for path, name in own.items()}
+        its_files = {configuration: "cyclonedds.xml", f"{its_keys}/{message_keys.CREDENTIAL}": message_keys.CREDENTIAL}
+        there |= {path: brought[robot.name][f"/etc/flotilla/{name}"] for path, name in its_files.items()}
         for name in robot.control_tasks:
             called = name + STANDBY if name in robot.standby else name
             file = f"{directory}/{called}.yml"
             there[file] = changed(name, brought[robot.name][_path(name)], plan.changes)
             task = {"name": called, "computer": robot.name, "file": file}
-            tasks.append(task | {"cyclonedds": configuration, "credentials": credentials})
+            tasks.append(task | {"cyclonedds": configuration, "credentials": its_keys})
     events = [asdict(event) for event in plan.events]
     if plan.stranger:
         shout = ["python3", f"{DIRECTORY}/stranger.py", str(plan.seconds), *_receivers(described, brought)]

@@ -6,6 +6,7 @@ come two CAN boards on one bus, and over SSH the plant, which is the drives at t
 This computer reaches the robots at loopback addresses of their own: what it sends to 127.43.1.1 arrives at the first
 robot from its station's address, and what that robot sends its station arrives here from 127.43.1.1. So whatever
 commands or watches robots does it with the inventory `station`, which has these addresses, and with no privilege.
+What a robot reports arrives here with a proof made here, by the robot's key: nothing that is sent back reaches it.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ import yaml
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import inventory
+from flotilla.fleet import inventory, message_keys
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.station import telemetry
+from flotilla.station.authentication import TRAILER, Signer
 from images.builder import build, runtime
 from lab.plants import wheeled
 from lab.qemu import qemu
@@ -238,6 +240,7 @@ class Live:
         self.robots: list[LiveRobot] = []
         self._streams = {(stream.robot, stream.port): stream for stream in telemetry.streams(fleet)}
         self._newest: dict[tuple[str, int], bytes] = {}
+        self._signers: dict[tuple[str, int], Signer] = {}
         self._changed = threading.Condition()
 
     @property
@@ -277,11 +280,24 @@ class Live:
         does."""
         if commands.answer(port, payload):
             return
-        with suppress(ConnectionRefusedError):
-            forward.sendto(payload, (self.station_address, port))
+        if (name, port) in self._streams:
+            self._report(name, forward, port, payload)
         with self._changed:
             self._newest[name, port] = payload
             self._changed.notify_all()
+
+    def _report(self, name: str, forward: socket.socket, port: int, message: bytes) -> None:
+        """To the station's programs on this computer, which may have asked for a proof that it is new."""
+        if not (signer := self._signers.get((name, port))):
+            (robot,) = (one.robot for one in self.robots if one.robot.name == name)
+            key = message_keys.read().between(robot, self.fleet.stations[0])
+            signer = self._signers[name, port] = Signer(key, port)
+        with suppress(BlockingIOError):
+            while True:
+                with suppress(ConnectionRefusedError):  # nobody listened to an earlier report
+                    signer.challenged(forward.recv(_LONGEST))
+        with suppress(ConnectionRefusedError):
+            forward.sendto(signer.sign(message[:-TRAILER]), (self.station_address, port))
 
 
 @contextmanager
@@ -329,6 +345,7 @@ def robots(
             stack.callback(commands.close)
             forward = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             forward.bind((address, 0))
+            forward.setblocking(False)
             cable = Cable(wire, station, functools.partial(live.heard, robot.name, commands, forward))
             stack.callback(cable.close)
             port = segment.ssh_port(robot.address)

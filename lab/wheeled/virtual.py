@@ -17,11 +17,12 @@ import yaml
 
 from flotilla.common import progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity
+from flotilla.fleet import identity, message_keys
 from flotilla.fleet.model import Board, Fleet
 from flotilla.station import telemetry
 from images.builder import runtime
 from lab.latency import machine, results, subject
+from lab.scenarios import virtual
 from lab.scenarios.flight import Record, records
 from lab.scenarios.virtual import PLANT, far
 from lab.wheeled import plant
@@ -45,6 +46,7 @@ LASER = "/dev/robot/laser"
 COMMAND_PORT = 5030
 """As drive.yml has it."""
 TASKS = ("perceive", "drive")
+_KEYS = f"{DIRECTORY}/{message_keys.CREDENTIAL}"
 _BOOT_LIMIT_S = 600
 _LIMIT_PER_SECOND = 40
 """Of the host's clock, for each virtual second: finite, and generous to a busy host."""
@@ -145,7 +147,7 @@ class Driven:
         return [report for report in self.reports if begin_s <= self.at_s(report) < end_s]
 
 
-def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str, bytes]:
+def files(courses: Sequence[Course], described: Fleet, board: Board, keys: Path) -> dict[str, bytes]:
     """What enters the guest: by path."""
     robot = described.robot_with("drive")
     tasks = identity.control_tasks(described, robot)
@@ -153,7 +155,8 @@ def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str
         f"{DIRECTORY}/plant/plant.so": runtime.compile_plugin(PLANT, board.system),
         f"{DIRECTORY}/guest.py": (HERE / "guest.py").read_bytes(),
     }
-    there |= {f"{DIRECTORY}/{name}.yml": _believing(tasks[name]) for name in TASKS}
+    there |= {f"{DIRECTORY}/{name}.yml": _changed(tasks[name]) for name in TASKS}
+    there[_KEYS] = virtual.credentials(described, robot, keys)
     listed = []
     for course in courses:
         file = f"{DIRECTORY}/{course.name}.yml"
@@ -172,11 +175,13 @@ def files(courses: Sequence[Course], described: Fleet, board: Board) -> dict[str
     return there | {f"{DIRECTORY}/session.json": json.dumps(document, sort_keys=True).encode()}
 
 
-def _believing(task: bytes) -> bytes:
-    """It takes commands without a proof: the guest's Python has no library that could make one."""
+def _changed(task: bytes) -> bytes:
+    """It takes commands without a proof: the guest's Python has no library that could make one. What it says itself it
+    proves."""
     told = yaml.safe_load(task)
-    if taking := told["blocks"].get("command"):
-        del taking["parameters"]["keys"]
+    for block in told["blocks"].values():
+        if "keys" in block.get("parameters", {}):
+            block["parameters"]["keys"] = "" if block["type"] == "udp-receive" else _KEYS
     return yaml.safe_dump(told, sort_keys=False).encode()
 
 
@@ -187,11 +192,12 @@ def _stream(described: Fleet) -> telemetry.Stream:
 def drive(courses: Sequence[Course], board: Board, out: Path) -> dict[str, Driven]:
     """Drive one course after the other in one guest; by their names."""
     described = fleet()
-    out.mkdir(parents=True, exist_ok=True)
+    (out / "keys").mkdir(parents=True, exist_ok=True)
     measured = subject.build(board)
     initrd = out / "initrd.img"
     commands = {"session": ["python3", f"{DIRECTORY}/guest.py", f"{DIRECTORY}/session.json"]}
-    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, files(courses, described, board))
+    brought = files(courses, described, board, out / "keys")
+    subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, brought)
     guest = machine.Machine(
         machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=CAN_BOARDS, shift=SHIFT
     )

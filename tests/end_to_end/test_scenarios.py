@@ -330,6 +330,20 @@ def test_reflected_messages_are_refused_and_counted(flights: Callable[[str], Fli
     assert set(came_back(flights("udp")).values()) == {0}
 
 
+def test_false_telemetry_and_positions_are_refused_and_counted(flights: Callable[[str], Flight]) -> None:
+    """By a station, what is sent in a robot's name; by a robot, what is sent in a station's. Seen to fail with a station and
+    sensors that ask for no proof."""
+    flight, quiet = flights("strangers"), flights("udp")
+    for task, block in (("second", "report"), ("second", "flight"), ("sensors", "igps")):
+        kinds = flight.refused[task][block]
+        print(f"{task}, {block}: {kinds}")
+        assert all(kinds[kind] > 0.01 * len(flight.steps) for kind in ("refused", "forged", "replayed"))
+    for task, block in (("station", "report"), ("station", "flight"), ("sensors", "igps")):
+        assert quiet.refused[task][block].keys() <= {"replayed"}
+    numbers = [record["number"] for record in flight.second_station]
+    assert numbers == sorted(numbers), "an altered or recorded report was taken"
+
+
 def test_a_second_station_hears_the_same_and_disturbs_nobody(flights: Callable[[str], Flight]) -> None:
     """Its positions are a metre off, and the square is flown all the same; it goes on when the first one is gone."""
     flight = flights("strangers")

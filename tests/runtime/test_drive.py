@@ -28,7 +28,7 @@ from flotilla.station import inputs, telemetry
 from flotilla.station.driving import COMMAND, Motion
 from lab.wheeled import by_wires
 from tests.running import PATIENCE
-from tests.station import LOOPBACK, secret_in
+from tests.station import LOOPBACK, ProvenWay, secret_in
 
 ROBOT, STATION = LOOPBACK + "1", LOOPBACK + "254"
 KEYS = "keys"
@@ -53,8 +53,9 @@ class Robot:
     """By a thread of its own: takes commands, and reports unless it is to be silent."""
 
     def __init__(self, fleet: Path) -> None:
-        streams = telemetry.streams(inventory.load_fleet(fleet))
-        (self._stream,) = (stream for stream in streams if stream.task == "drive")
+        described = inventory.load_fleet(fleet)
+        (self._stream,) = (stream for stream in telemetry.streams(described) if stream.task == "drive")
+        self._way = ProvenWay(self._stream, described)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((ROBOT, 5030))
         self.commands: list[Sent] = []
@@ -75,7 +76,7 @@ class Robot:
             if time.monotonic() >= next_s:
                 step, next_s = step + 10, time.monotonic() + INTERVAL_S
                 if not self.silent:
-                    self._socket.sendto(self._report(step), (STATION, self._stream.port))
+                    self._way.send(self._report(step))
 
     def _report(self, step: int) -> bytes:
         number, sequence, motion = self.commands[-1] if self.commands else (0, 0, Motion(0, 0, 0.2, False))
@@ -124,6 +125,7 @@ class Robot:
         self._ended.set()
         self._thread.join()
         self._socket.close()
+        self._way.close()
 
 
 @pytest.fixture

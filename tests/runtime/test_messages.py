@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import shutil
-import socket
 import struct
-import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ import pytest
 from flotilla.common import paths
 from flotilla.fleet import identity, inventory, message_keys
 from flotilla.fleet.model import Fleet
-from flotilla.station import telemetry
-from flotilla.station.receiver import Receiver
+from flotilla.station import station_keys, telemetry
+from flotilla.station.receiver import Receiver, drain, listen
 from flotilla.station.record import Recorder
 from tests.running import DDS_ON_LOOPBACK, PATIENCE, free_port, running
 from tests.station import decoded, on_loopback, pymcap
@@ -109,6 +109,24 @@ def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
     return described.model_copy(update={"robots": {1: robot}, "network": network})
 
 
+class Heard:
+    """A sink that keeps what it gets, in the order of HEARD."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[Any, ...]] = []
+
+    def take(self, stream: telemetry.Stream, values: Mapping[str, Any], received_ns: int) -> None:
+        names = ("small", "step", "wide", "fresh", "half")
+        small, step, wide, fresh, half = (values[name] for name in names)
+        self.messages.append((small, step, *wide, fresh, half))
+
+    def refresh(self) -> None:
+        """Nothing is shown."""
+
+    def end(self) -> str:
+        return ""
+
+
 def by(transport: str, fleet: Fleet) -> Fleet:
     return fleet.model_copy(update={"network": fleet.network.model_copy(update={"transport": transport})})
 
@@ -119,30 +137,31 @@ def test_a_message_is_added_by_data_alone(transport: str, fleet: Fleet, flotilla
     fleet = by(transport, fleet)
     texts = {name: task.decode() for name, task in identity.control_tasks(fleet, fleet.robots[1]).items()}
     robot = fleet.robots[1]
-    key = message_keys.read().between(robot, robot)
-    (tmp_path / message_keys.CREDENTIAL).write_text(f"{robot.address} {key} {key}\n")
+    keys = message_keys.read().lines(robot, identity.hosts(fleet))
+    (tmp_path / message_keys.CREDENTIAL).write_text(keys)
     (stream,) = telemetry.streams(fleet)
     assert (stream.topic, stream.length, stream.every) == ("/robot1/sink/heard", HEARD.size, 2)
     file = tmp_path / "a.mcap"
-    receiver, recorder = Receiver([stream]), Recorder([stream], file)
-    receiver.sinks.append(recorder)
+    receiver, recorder = Receiver([stream], station_keys.of_telemetry(fleet)), Recorder([stream], file)
+    heard = Heard()
+    receiver.sinks += [recorder, heard]
     command: list[str | Path] = [flotilla_run, "--blocks", str(flotilla_run.parent)]
-    datagrams: list[tuple[Any, ...]] = []
     with ExitStack() as stack:
-        station = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        station.bind(("127.0.0.254", stream.port))
-        station.settimeout(PATIENCE)
+        (station,) = listen([stream.port], "127.0.0.254")
+        stack.enter_context(station)
         for name in ("sink", "source"):
             environment = {"CYCLONEDDS_URI": DDS_ON_LOOPBACK, "CREDENTIALS_DIRECTORY": str(tmp_path)}
             stack.enter_context(running(command, tmp_path / f"{name}.yml", texts[name], environment))
-        while sum(fresh for *_, fresh, _ in datagrams) < MANY:
-            datagram, (address, _) = station.recvfrom(1 << 16)
-            receiver.take(datagram, address, stream.port, time.time_ns())
-            datagrams.append(HEARD.unpack(datagram))
-            assert len(datagrams) < 100 * MANY, receiver.summary
+        while sum(fresh for *_, fresh, _ in heard.messages) < MANY:
+            assert select.select([station], [], [], PATIENCE)[0], receiver.summary
+            drain(station, receiver)
+            assert len(heard.messages) < 100 * MANY, receiver.summary
     recorder.end()
+    count = receiver.counts[stream.topic]
+    assert (receiver.strangers, count.refused, count.forged) == (0, 0, 0)
+    assert 0 < count.replayed < 10, "those before the robot has answered the challenge"
     # What blocks packed, unpacked and packed again.
-    for small, step, time_s, minus, two, fresh, half in datagrams:
+    for small, step, time_s, minus, two, fresh, half in heard.messages:
         if fresh:
             assert (small, minus, two, half) == (-7, -1.5, 2, pytest.approx(time_s / 2))
             periods = time_s / 0.01  # some may have been skipped
@@ -151,7 +170,7 @@ def test_a_message_is_added_by_data_alone(transport: str, fleet: Fleet, flotilla
     recorded = [
         (message.small, message.step, *message.wide, message.fresh, message.half) for _, message in decoded(file)
     ]
-    assert recorded == datagrams
+    assert recorded == heard.messages
     (schema,) = json.loads(pymcap("info-json", file).stdout)["schemas"]
     assert schema["name"] == "flotilla.SinkHeard"
     doctor = pymcap("doctor", file)

@@ -12,19 +12,18 @@ from pathlib import Path
 
 from flotilla.common import paths
 from tests.running import PATIENCE
-from tests.station import ADDRESS, Robots, on_loopback, station
+from tests.station import ADDRESS, Robots, on_loopback, secret_in, station
 
 
 def test_one_table_where_there_is_no_terminal(tmp_path: Path) -> None:
     """A tenth of the steps is left out. Seen to fail where all are sent, and where only a signal ends it."""
     fleet = on_loopback(tmp_path / "inventory")
-    robots = Robots(fleet)
 
     def ended() -> bool:
         robots.sent["valves"] += robots.sent["valves"] % 10 == 9
         return process.poll() is not None
 
-    with station(fleet, "top") as process:
+    with Robots(fleet) as robots, station(fleet, "top") as process:
         robots.until(ended)
         said, complaints = process.communicate(timeout=PATIENCE)
     assert (process.returncode, complaints) == (0, "")
@@ -46,7 +45,8 @@ def test_keys_on_a_terminal(tmp_path: Path) -> None:
     argv = [sys.executable, "-m", "flotilla", "top", "--inventory", str(fleet), "--address", ADDRESS]
     with subprocess.Popen(
         argv, cwd=paths.PROJECT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
-        preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)), env=os.environ | {"TERM": "xterm"},
+        preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),
+        env=os.environ | {"TERM": "xterm"} | secret_in(tmp_path / "keys"),
     ) as process:  # fmt: skip
         os.close(theirs)
         try:

@@ -43,18 +43,18 @@ def with_network(fleet: Fleet, **values: object) -> Fleet:
 
 
 def test_the_description_says_what_is_sent(published: Fleet, four: traffic.Description) -> None:
-    """Bytes of signals by messages.yml, 28 of IPv4 and UDP, and between robots 40 of the proof of their sender; hops
-    follow triggers, from task to task."""
+    """Bytes of signals by messages.yml, 28 of IPv4 and UDP, and 40 of the proof of their sender; hops follow triggers,
+    from task to task."""
     sent = {flow.name: flow for task in four.tasks for flow in task.flows}
     assert {name: (flow.sender, flow.receivers, flow.every) for name, flow in sent.items()} == {
         "sensors": (0, (1,), 1), "state": (1, (2,), 1), "wrench": (2, (3,), 1), "valves": (3, (0,), 1),
         "valves-report": (0, (4,), 1), "control-report": (2, (4,), 10),
     }  # fmt: skip
     assert {name: flow.packet for name, flow in sent.items()} == {
-        name: published.messages[name].bytes + 28 + (0 if name.endswith("-report") else 40) for name in sent
+        name: published.messages[name].bytes + 28 + 40 for name in sent
     }
     assert [(chain.name, chain.period_ns) for chain in four.chains] == [(CHAIN, LIMIT_NS)]
-    assert [(flow.receivers, flow.packet, period_ns) for flow, period_ns in four.positions] == [((0,), 44, LIMIT_NS)]
+    assert [(flow.receivers, flow.packet, period_ns) for flow, period_ns in four.positions] == [((0,), 84, LIMIT_NS)]
 
 
 def test_by_dds_messages_are_longer_and_programs_announce_themselves(
@@ -63,7 +63,7 @@ def test_by_dds_messages_are_longer_and_programs_announce_themselves(
     by_dds = traffic.describe(with_network(published, transport="dds"))
     sent = {flow.name: flow.packet for task in by_dds.tasks for flow in task.flows}
     assert sent["sensors"] == published.messages["sensors"].bytes + 28 + 80
-    assert sent["valves-report"] == published.messages["valves-report"].bytes + 28, "reports go by UDP"
+    assert sent["valves-report"] == published.messages["valves-report"].bytes + 28 + 40, "reports go by UDP"
     assert [chain.name for chain in by_dds.chains] == [CHAIN]
     assert by_dds.dds_peers == {0: (2, 3), 1: (1, 2), 2: (1, 2), 3: (1, 2)}
     monkeypatch.setattr(load, "SPDP_NS", 10**9)
@@ -100,7 +100,7 @@ def test_a_fleet_that_sends_nothing_has_no_answer() -> None:
 def test_air_time_by_hand(four: traffic.Description) -> None:
     """802.11b, 11 Mbit/s, long preamble, ACK at 2 Mbit/s: frames with 36 bytes of LLC and MAC, 0.625 NTP packets, and
     beacons at 1 Mbit/s."""
-    sizes = {174: 100, 185: 100, 161: 100, 173: 100, 153: 100, 80: 100, 162: 10, 132: 0.625}
+    sizes = {174: 100, 185: 100, 161: 100, 173: 100, 193: 100, 120: 100, 202: 10, 132: 0.625}
     air = sum(rate * (192 + -(-8 * size // 11) + 10 + 248) for size, rate in sizes.items()) / 1e6
     air += (192 + 8 * (28 + 12 + 2 + 8 + 10 + 3 + 4)) / 102_400
     computed = model.compute(four, B, 1)

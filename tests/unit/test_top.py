@@ -8,6 +8,7 @@ import pytest
 
 from flotilla.fleet.inventory import load_fleet
 from flotilla.fleet.model import Fleet, Message, Signal
+from flotilla.station.authentication import TRAILER, Signer
 from flotilla.station.receiver import Receiver
 from flotilla.station.recording import Field
 from flotilla.station.services import State, TaskStatus
@@ -15,6 +16,8 @@ from flotilla.station.telemetry import Stream, streams
 from flotilla.station.top import Row, StreamStats, Top
 
 SECOND_NS = 1_000_000_000
+STATION, LOOPBACK = "10.42.0.254", "127.0.0.1"
+KEY = "42" * 32
 STREAM = Stream(
     robot="robot1",
     task="valves",
@@ -89,20 +92,29 @@ def test_the_table_says_it() -> None:
     """Seen to fail with columns exchanged."""
     now_ns = 0
     other = Stream("robot2", "control", "report", "10.42.0.2", 5021, STREAM.fields[1:], 0.01, 10)
-    receiver = Receiver([STREAM, other])
+    receiver = Receiver([STREAM, other], lambda _, address: KEY if address == STATION else None)
+    signer = Signer(KEY, STREAM.port)
     top = Top(receiver, clock=lambda: now_ns)
     receiver.sinks.append(top)
     for step in range(2, 402, 2):
         now_ns += 20_000_000
         if step % 8:
-            receiver.take(step.to_bytes(2, "little") + b"\x01" + bytes(9), STREAM.address, STREAM.port, now_ns)
-    receiver.take(b"short", other.address, other.port, now_ns)
-    receiver.take(bytes(12), "10.42.0.9", STREAM.port, now_ns)
+            message = signer.sign(step.to_bytes(2, "little") + b"\x01" + bytes(9))
+            if challenge := receiver.take(message, STREAM.address, (STATION, STREAM.port), now_ns):
+                assert signer.challenged(challenge)
+                message = signer.sign(message[:-TRAILER])
+                receiver.take(message, STREAM.address, (STATION, STREAM.port), now_ns)
+    receiver.take(b"short", other.address, (STATION, other.port), now_ns)
+    receiver.take(message, STREAM.address, (STATION, STREAM.port), now_ns)
+    receiver.take(message[:-1] + b"?", STREAM.address, (STATION, STREAM.port), now_ns)
+    receiver.take(message, STREAM.address, (LOOPBACK, STREAM.port), now_ns)
+    receiver.take(message, "10.42.0.9", (STATION, STREAM.port), now_ns)
     assert [" ".join(line.split()) for line in top.end().splitlines()] == [
         "robot task ms stream Hz of came refused lost % link% age s charge% flags",
-        "robot1 valves 10 report 37.5 50 150 0 49 24.6 76 0.02 good, not flying",
+        "robot1 valves 10 report 37.5 50 150 1 49 24.6 76 0.02 good, not flying",
         "robot2 control 10 report 0.0 10 0 1 never",
-        "1 datagrams of strangers left out",
+        "left out as robot1's valves report: 1 forged, 2 replayed",
+        "2 datagrams of strangers left out",
     ]
 
 
