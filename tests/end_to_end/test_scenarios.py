@@ -331,8 +331,8 @@ def test_reflected_messages_are_refused_and_counted(flights: Callable[[str], Fli
 
 
 def test_false_telemetry_and_positions_are_refused_and_counted(flights: Callable[[str], Flight]) -> None:
-    """By a station, what is sent in a robot's name; by a robot, what is sent in a station's. Seen to fail with a station and
-    sensors that ask for no proof."""
+    """By a station, what is sent in a robot's name; by a robot, what is in a station's. Seen to fail with a station
+    and sensors that ask for no proof."""
     flight, quiet = flights("strangers"), flights("udp")
     for task, block in (("second", "report"), ("second", "flight"), ("sensors", "igps")):
         kinds = flight.refused[task][block]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import closing
+from ipaddress import IPv4Address
 
 import pytest
 
@@ -35,10 +36,13 @@ def _listeners(robot: RobotGuest) -> set[tuple[str, str, str]]:
     return found
 
 
+def _taken(fleet: Fleet) -> list[IPv4Address]:
+    return [host.address for host in identity.hosts(fleet)]
+
+
 def test_firewall_admits_the_fleet_alone(robot: RobotGuest, fleet: Fleet) -> None:
     """By packets from a neighbour, a network namespace at the other end of a virtual cable."""
-    taken = [host.address for host in identity.hosts(fleet)]
-    inside = next(address for address in fleet.network.subnet.hosts() if address not in taken)
+    inside = next(address for address in fleet.network.subnet.hosts() if address not in _taken(fleet))
     dds = 7400 + 250 * fleet.network.dds_domain + 10
     closed = call(robot, firewall, str(inside), dds, "")
     open_for_fleet = {"tcp 22", f"udp {dds}", "udp 5000", "ping"}
@@ -47,6 +51,19 @@ def test_firewall_admits_the_fleet_alone(robot: RobotGuest, fleet: Fleet) -> Non
     opened = call(robot, firewall, str(inside), dds, "insert rule inet flotilla input accept")
     everything = open_for_fleet | {"tcp 2323", "udp 2323"}
     assert set(opened["outside"]) == everything, f"with an open firewall only {opened} came through: a blind probe"
+
+
+def test_wrong_rules_leave_the_robot_closed(robot: RobotGuest, fleet: Fleet) -> None:
+    """But for SSH and echo. Seen to fail without the rules that come before: nothing was closed."""
+    inside = str(next(address for address in fleet.network.subnet.hosts() if address not in _taken(fleet)))
+    dds = 7400 + 250 * fleet.network.dds_domain + 10
+    sh(robot, "echo 'table inet flotilla {' > /run/wrong.nft; mount --bind /run/wrong.nft /etc/nftables.conf")
+    try:
+        sh(robot, "! systemctl restart nftables")
+        found = call(robot, firewall, inside, dds, "")
+        assert [set(found[where]) for where in ("inside", "outside")] == [{"tcp 22", "ping"}] * 2
+    finally:
+        sh(robot, "umount /etc/nftables.conf; systemctl restart nftables")
 
 
 def test_nobody_without_the_key_tells_the_time(
