@@ -262,6 +262,12 @@ void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *
     FL_OUT(block, first + 2, uint32_t) = receiver->sender;
 }
 
+void udp_keys_outputs(const struct udp_receiver *receiver, struct fl_block *block, uint32_t first)
+{
+    FL_OUT(block, first, uint32_t) = receiver->forged;
+    FL_OUT(block, first + 1, uint32_t) = receiver->replayed;
+}
+
 void udp_receiver_close(struct udp_receiver *receiver)
 {
     udp_sockets_close(&receiver->sockets);

@@ -102,6 +102,19 @@ struct udp_receiver {
          .width = 1,                                                                                                   \
          .summary = "rank of the sender that is listened to: 0 is the first of `from`"}
 
+/* Further outputs of a block with `keys`. */
+#define UDP_KEYS_OUTPUTS                                                                                               \
+    {.name = "forged",                                                                                                 \
+     .type = FL_UINT32,                                                                                                \
+     .width = 1,                                                                                                       \
+     .flags = FL_REFUSALS,                                                                                             \
+     .summary = "datagrams that no key of `keys` proves"},                                                             \
+        {.name = "replayed",                                                                                           \
+         .type = FL_UINT32,                                                                                            \
+         .width = 1,                                                                                                   \
+         .flags = FL_REFUSALS,                                                                                         \
+         .summary = "datagrams that came again or late, or came before their sender proved them new"}
+
 /* For `configure`: check the addresses among the parameters. */
 int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_strings from);
 
@@ -112,6 +125,9 @@ int udp_receiver_open(struct udp_receiver *receiver, struct fl_block *block, con
 
 /* Write the outputs UDP_RECEIVER_OUTPUTS, of which `dropped` is number `first`. */
 void udp_receiver_outputs(const struct udp_receiver *receiver, struct fl_block *block, uint32_t first);
+
+/* Write the outputs UDP_KEYS_OUTPUTS, of which `forged` is number `first`. */
+void udp_keys_outputs(const struct udp_receiver *receiver, struct fl_block *block, uint32_t first);
 
 /* The time of arrival of a datagram on CLOCK_MONOTONIC. The kernel stamps by the wall clock, which may be set at any
  * time. So the result is limited to the possible interval, from when the queue was last empty until now. */

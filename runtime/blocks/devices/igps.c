@@ -7,6 +7,11 @@
  * beyond `range`: by that the system says that it does not see the robot. While the flag is 0 the values stay the last
  * good ones, and `age` grows. Datagrams of another length or sender are counted in `refused` and change nothing. The
  * journal says once why there is no position.
+ *
+ * With `keys` each datagram carries 40 bytes more, which prove that it is the sender's and new. A datagram without a right
+ * proof is not taken. It is counted in `refused` if it lacks the 40 bytes, in `forged` if they are wrong, and in
+ * `replayed` if it came before. The first datagram after a start of either side is counted in `replayed`, too: the
+ * sender is asked, with 40 bytes, to prove that its datagrams are new.
  */
 #include "core/udp.h"
 #include "igps_datagram.h"
@@ -16,6 +21,7 @@
 
 struct igps {
     UDP_RECEIVER_MEMBERS;
+    UDP_KEYS_MEMBER;
     int byte_order;
     double range;
     double timeout;
@@ -23,6 +29,7 @@ struct igps {
 
 static const struct fl_parameter parameters[] = {
     UDP_RECEIVER_PARAMETERS(struct igps),
+    UDP_KEYS_PARAMETER(struct igps),
     FL_PARAMETER(struct igps, byte_order, .default_value = "little-endian", .choices = "little-endian|big-endian",
                  .summary = "order of the bytes of a number; the iGPS computer is a PC, so least significant first"),
     FL_PARAMETER(struct igps, range, .default_value = "100", .min = 0, .max = 1e6, .unit = "m",
@@ -34,9 +41,10 @@ static const struct fl_port outputs[] = {
     {.name = "position", .type = FL_DOUBLE, .width = 2, .unit = "m", .summary = "x and y, the last good ones"},
     FL_SENSOR_OUTPUTS,
     UDP_RECEIVER_OUTPUTS,
+    UDP_KEYS_OUTPUTS,
 };
 
-enum { POSITION, FLAG, AGE, SEQUENCE, DROPPED };
+enum { POSITION, FLAG, AGE, SEQUENCE, DROPPED, REFUSED, SENDER, FORGED };
 enum { PATIENCE_S = 5 }; /* without a datagram, before that is logged */
 
 struct state {
@@ -44,13 +52,16 @@ struct state {
     struct fl_sensor sensor;
     struct fl_step_reasons *reasons;
     uint32_t refused;    /* before this step */
+    uint32_t forged;     /* likewise */
     int64_t received_ns; /* time of the last step that took a datagram, or of the first step */
 };
 
 static int configure(struct fl_block *block)
 {
     const struct igps *igps = block->parameters;
-    return udp_receiver_check(block, igps->local_address, igps->from);
+    if (udp_receiver_check(block, igps->local_address, igps->from) != FL_OK)
+        return FL_FAILED;
+    return udp_check_keys(block, "from", igps->keys, IGPS_BYTES, igps->from);
 }
 
 static int start(struct fl_block *block)
@@ -62,7 +73,7 @@ static int start(struct fl_block *block)
     if (!state->reasons)
         return FL_FAILED;
     return udp_receiver_open(&state->receiver, block, igps->local_address, igps->port, igps->interface, igps->from,
-                             igps->failover, IGPS_BYTES, "");
+                             igps->failover, IGPS_BYTES, igps->keys);
 }
 
 /* Why there is no position; NULL: only that none came just now. */
@@ -71,8 +82,12 @@ static const char *reason_of(const struct state *state, const struct fl_block *b
     if (unseen)
         return "the system does not see the robot: a position is not a number, or farther than `range`; with another "
                "`byte_order` all are";
+    if (state->receiver.forged != state->forged)
+        return "what comes proves no sender: it is forged, or its sender has another key than `keys`";
     if (state->receiver.refused != state->refused)
-        return "what comes is refused: it has not 16 bytes, or its sender is not in `from`";
+        return state->receiver.authenticated
+                   ? "what comes is refused: it has not 16 bytes and 40 of a proof, or its sender is not in `from`"
+                   : "what comes is refused: it has not 16 bytes, or its sender is not in `from`";
     if (block->release_ns - state->received_ns > PATIENCE_S * INT64_C(1000000000))
         return "no position comes: start the program that sends them to this port";
     return NULL;
@@ -87,6 +102,7 @@ static int step(struct fl_block *block)
     struct udp_budget budget = udp_budget_of(block);
     bool unseen = false;
     state->refused = state->receiver.refused;
+    state->forged = state->receiver.forged;
     if (block->step == 0)
         state->received_ns = block->release_ns;
     while (udp_receive(&state->receiver, bytes, &arrived_ns, &budget)) {
@@ -105,6 +121,7 @@ static int step(struct fl_block *block)
     }
     fl_sensor_outputs(&state->sensor, block, FLAG, true, igps->timeout);
     udp_receiver_outputs(&state->receiver, block, DROPPED);
+    udp_keys_outputs(&state->receiver, block, FORGED);
     const char *reason = FL_OUT(block, FLAG, bool) ? NULL : reason_of(state, block, unseen);
     if (reason)
         fl_step_reasons_log(state->reasons, reason);

@@ -41,16 +41,7 @@ static const struct fl_parameter parameters[] = {
 static const struct fl_port outputs[] = {
     FL_SENSOR_OUTPUTS,
     UDP_RECEIVER_OUTPUTS,
-    {.name = "forged",
-     .type = FL_UINT32,
-     .width = 1,
-     .flags = FL_REFUSALS,
-     .summary = "datagrams that no key of `keys` proves"},
-    {.name = "replayed",
-     .type = FL_UINT32,
-     .width = 1,
-     .flags = FL_REFUSALS,
-     .summary = "datagrams that came again or late, or came before their sender proved them new"},
+    UDP_KEYS_OUTPUTS,
 };
 
 enum { FLAG, AGE, SEQUENCE, DROPPED, REFUSED, SENDER, FORGED, REPLAYED, DATA };
@@ -123,8 +114,7 @@ static int step(struct fl_block *block)
         take(block);
     fl_sensor_outputs(&state->sensor, block, FLAG, true, udp->timeout);
     udp_receiver_outputs(&state->receiver, block, DROPPED);
-    FL_OUT(block, FORGED, uint32_t) = state->receiver.forged;
-    FL_OUT(block, REPLAYED, uint32_t) = state->receiver.replayed;
+    udp_keys_outputs(&state->receiver, block, FORGED);
     return FL_OK;
 }
 

@@ -3,12 +3,16 @@
 #include "said.h"
 
 #include "blocks/devices/igps_datagram.h"
+#include "core/authentication.h"
 
 #include <math.h>
 
 /* Y = 1.5 m (0x3ff8...), X = -2.25 m (0xc002...), least significant byte first. */
 static const uint8_t little[16] = {0, 0, 0, 0, 0, 0, 0xf8, 0x3f, 0, 0, 0, 0, 0, 0, 0x02, 0xc0};
 static const uint8_t big[16] = {0x3f, 0xf8, 0, 0, 0, 0, 0, 0, 0xc0, 0x02, 0, 0, 0, 0, 0, 0};
+
+#define A_KEY  "000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f"
+#define NO_KEY "ff0102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f"
 
 /* A datagram as the iGPS computer packs it. */
 static void pack(uint8_t bytes[16], double y, double x)
@@ -199,6 +203,70 @@ static void flags_silence(void **state)
     testbed_end(igps);
 }
 
+/* The sender is a block udp-send with the same keys; the attacker has its address and no key. */
+static void takes_what_its_sender_proves(void **state)
+{
+    (void)state;
+    static const uint8_t nothing[IGPS_BYTES + AUTHENTICATION_TRAILER];
+    char directory[] = "/tmp/flotilla-igps-XXXXXX", file[64];
+    assert_non_null(mkdtemp(directory));
+    snprintf(file, sizeof file, "%s/message-keys", directory);
+    FILE *stream = fopen(file, "we");
+    assert_non_null(stream);
+    assert_true(fprintf(stream, "127.0.0.1 %s %s\n127.0.0.2 %s %s\n", A_KEY, NO_KEY, NO_KEY, A_KEY) > 0);
+    assert_int_equal(fclose(stream), 0);
+
+    struct system attacker = {bare("127.0.0.2", 0), free_port()};
+    struct said said = said_begin();
+    struct fl_block *igps =
+        testbed_block("igps", "port", attacker.port, "from", "127.0.0.2", "timeout", "60", "keys", file, NULL);
+    struct fl_block *send = testbed_block("udp-send", "address", "127.0.0.1", "local_address", "127.0.0.2", "port",
+                                          attacker.port, "length", "16", "keys", file, NULL);
+    igps->period_ns = INT64_C(3600000000000); /* to look at what is refused has all the time that it takes */
+    testbed_begin(igps);
+    testbed_begin(send);
+    pack(testbed_input(send, "data"), 3, 4);
+    for (int i = 0; i < 3; i++) {
+        testbed_step(send);
+        settle();
+        step(igps);
+        settle();
+    }
+    assert_true(GET(igps, "flag", bool));
+    assert_near(position_of(igps)[0], 4, 0);
+    assert_near(position_of(igps)[1], 3, 0);
+    assert_int_equal(GET(igps, "sequence", uint32_t), 2);
+    assert_int_equal(GET(igps, "replayed", uint32_t), 1);
+
+    send_position(&attacker, 7, 7);
+    send_bytes(&attacker, nothing, sizeof nothing);
+    step(igps);
+    assert_near(position_of(igps)[0], 4, 0);
+    assert_int_equal(GET(igps, "sequence", uint32_t), 2);
+    assert_int_equal(GET(igps, "refused", uint32_t), 1);
+    assert_int_equal(GET(igps, "forged", uint32_t), 1);
+    assert_int_equal(said_times(&said, "igps: "), 0); /* there is a position */
+    testbed_end(igps);
+
+    igps = testbed_block("igps", "port", attacker.port, "from", "127.0.0.2", "timeout", "60", "keys", file, NULL);
+    testbed_begin(igps);
+    send_bytes(&attacker, nothing, sizeof nothing);
+    step(igps);
+    testbed_end(igps);
+    assert_int_equal(said_times(&said, "what comes proves no sender"), 1);
+    igps = testbed_block("igps", "port", attacker.port, "from", "127.0.0.2", "timeout", "60", "keys", file, NULL);
+    testbed_begin(igps);
+    send_position(&attacker, 7, 7);
+    step(igps);
+    testbed_end(igps);
+    assert_int_equal(said_times(&said, "what comes is refused: it has not 16 bytes and 40 of a proof"), 1);
+    said_end(&said);
+    testbed_end(send);
+    close(attacker.fd);
+    unlink(file);
+    rmdir(directory);
+}
+
 /* Each cause by a block of its own: what its last step saw is logged at its end. */
 static void says_why_there_is_no_position(void **state)
 {
@@ -243,6 +311,8 @@ static void refuses(void **state)
     assert_non_null(strstr(testbed_refusal("igps", "port", "5000", "range", "-1", NULL), "-1 is outside 0 to 1e+06 m"));
     assert_non_null(
         strstr(testbed_refusal("igps", "port", "5000", "from", "here", NULL), "here is not an IPv4 address"));
+    assert_non_null(strstr(testbed_refusal("igps", "port", "5000", "keys", "/message-keys", NULL),
+                           "parameter keys: 0.0.0.0 is many computers"));
     assert_non_null(strstr(testbed_refusal("igps", NULL), "parameter port of igps is missing"));
 }
 
@@ -256,6 +326,7 @@ int main(void)
         cmocka_unit_test(follows_big_endian),
         cmocka_unit_test(flags_what_cannot_be),
         cmocka_unit_test(flags_silence),
+        cmocka_unit_test(takes_what_its_sender_proves),
         cmocka_unit_test(says_why_there_is_no_position),
         cmocka_unit_test(refuses),
     };
