@@ -53,7 +53,10 @@ def dds_peers(fleet: Fleet, robot: Robot) -> list[str]:
 def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
     """What control tasks may use, besides `message` of transport.py."""
     board = fleet.boards[robot.board]
-    return {"fleet": fleet, "network": fleet.network, "robot": robot, "board": board, "addresses": transport.addresses}
+    return {
+        "fleet": fleet, "network": fleet.network, "robot": robot, "board": board, "addresses": transport.addresses,
+        "keys": message_keys.CREDENTIAL,
+    }  # fmt: skip
 
 
 def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
