@@ -43,6 +43,9 @@ RECORD_S = 0.05
 """Between two records of the plant."""
 TIMEOUT_NS = round((TIMEOUT_S + RECORD_S) * 1e9)
 
+TURN = 0.05
+"""At least so often in a period a receiver's messages are forged, for which its nine take turns."""
+
 CONTROL_TASKS = ("sensors", "navigation", "control", "thruster-mapping", "valves")
 LATE = 0.15
 """Of steps over the air whose four hops may take longer than the limit."""
@@ -299,7 +302,7 @@ def test_strangers_are_refused_and_counted(flights: Callable[[str], Flight]) -> 
     last = flight.steps[-1]
     steps = flight.statistics["valves"]["steps"]
     print(f"refused {last['refused']} until the station was gone, in {steps} steps; lost {flight.lost()}")
-    assert last["refused"] > 0.5 * len(flight.steps)
+    assert last["refused"] > 0.3 * len(flight.steps)
     assert {record["refused"] for record in flights("udp").steps} == {0}
 
 
@@ -308,7 +311,7 @@ def test_forged_and_replayed_commands_are_refused_and_counted(flights: Callable[
     flight = flights("strangers")
     last = flight.steps[-1]
     print(f"forged {last['forged']}, replayed {last['replayed']}; lost {flight.lost()}")
-    assert last["forged"] > 1.8 * last["replayed"] > 0.2 * len(flight.steps)
+    assert last["forged"] > 1.8 * last["replayed"] > TURN * len(flight.steps)
     assert {record["forged"] for record in flights("udp").steps} == {0}
     replayed = {record["replayed"] for record in flights("udp").in_flight}
     assert len(replayed) == 1, "more than the first messages of all, before the robots knew each other"
@@ -326,7 +329,7 @@ def test_reflected_messages_are_refused_and_counted(flights: Callable[[str], Fli
 
     flight = flights("strangers")
     print(f"came back {came_back(flight)} in {len(flight.steps)} steps")
-    assert all(count > 0.1 * len(flight.steps) for count in came_back(flight).values())
+    assert all(count > TURN * len(flight.steps) for count in came_back(flight).values())
     assert set(came_back(flights("udp")).values()) == {0}
 
 
@@ -337,7 +340,7 @@ def test_false_telemetry_and_positions_are_refused_and_counted(flights: Callable
     for task, block in (("second", "report"), ("second", "flight"), ("sensors", "igps")):
         kinds = flight.refused[task][block]
         print(f"{task}, {block}: {kinds}")
-        assert all(kinds[kind] > 0.01 * len(flight.steps) for kind in ("refused", "forged", "replayed"))
+        assert all(kinds[kind] > TURN / 2 * len(flight.steps) for kind in ("refused", "forged", "replayed"))
     for task, block in (("station", "report"), ("station", "flight"), ("sensors", "igps")):
         assert quiet.refused[task][block].keys() <= {"replayed"}
     numbers = [record["number"] for record in flight.second_station]
@@ -350,7 +353,8 @@ def test_a_second_station_hears_the_same_and_disturbs_nobody(flights: Callable[[
     first, second = ([record["number"] for record in heard] for heard in (flight.steps, flight.second_station))
     gone = [record for record in flight.second_station if record["time_ns"] > flight.events_ns[-1]]
     print(f"the first heard of {len(set(first))} steps, the second of {len(set(second))}, {len(gone)} of them alone")
-    assert len(set(first) - set(second)) <= 0.001 * len(first)
+    both = {number for number in first if number >= min(filter(None, second))}
+    assert len(both - set(second)) <= 0.001 * len(first)
     assert len(gone) > 300
 
 
