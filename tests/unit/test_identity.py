@@ -13,7 +13,7 @@ import yaml
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity
+from flotilla.fleet import identity, message_keys
 from flotilla.fleet.inventory import load_fleet
 from flotilla.fleet.model import Acceptance, Device, Fleet, Ibss, IsaResources, Robot
 from flotilla.station import telemetry
@@ -125,13 +125,14 @@ def test_a_robot_that_stands_by_is_sent_to_and_listened_to() -> None:
 
 
 def test_stations_hear_all_and_the_first_says_where_the_robot_is() -> None:
-    """Seen to fail when a stream was looked for by one address."""
+    """And a station proves that it does. Seen to fail when a stream was looked for by one address, and without keys."""
     flying = virtual.fleet("udp", second_station=True)
     sensors, valves = (
         yaml.safe_load(identity.control_tasks(flying, flying.robot_with(task))[task])["blocks"]
         for task in ("sensors", "valves")
     )
     both = ["170.160.1.254", "170.160.1.252"]
+    assert sensors["igps"]["parameters"]["keys"] == message_keys.CREDENTIAL
     assert sensors["igps"]["parameters"]["from"] == valves["to_station"]["parameters"]["address"] == both
     assert {stream.port for stream in telemetry.streams(flying)} == {5020, 5021}
 
