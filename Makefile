@@ -237,7 +237,7 @@ bench: | setup-tests ## wall times and ratios against other builders
 	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
-.PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive fetch convert report
+.PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive positions fetch convert report
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
@@ -288,6 +288,10 @@ top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS
 
 drive: | setup ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN] [INVENTORY=]
 	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT) $(call option,--inventory,INVENTORY)
+
+positions: | setup ## positions of the indoor positioning system to a robot, with proof: make positions ROBOT=3 [PORT=5010] [STATION=] [INVENTORY=]
+	$(Q)$(FLOTILLA) positions $(call need,ROBOT) $(call option,--port,PORT) $(call option,--station,STATION) \
+	    $(call option,--inventory,INVENTORY)
 
 fetch: | setup ## recorder files of a robot's task: make fetch ROBOT=3 TASK=heading [OUT=directory]
 	$(Q)$(FLOTILLA) fetch $(call need,ROBOT) $(call need,TASK) $(call option,--out,OUT)

@@ -519,6 +519,18 @@ def _drive_arguments(parser: argparse.ArgumentParser) -> None:
     drive.drive_arguments(parser)
 
 
+def _positions(arguments: argparse.Namespace) -> None:
+    from flotilla.station import positions
+
+    positions.run(arguments)
+
+
+def _positions_arguments(parser: argparse.ArgumentParser) -> None:
+    from flotilla.station import positions
+
+    positions.positions_arguments(parser)
+
+
 def _page(arguments: argparse.Namespace) -> None:
     from flotilla.station import page_command
 
@@ -648,6 +660,8 @@ COMMANDS = (
     Command("Robots", "station-time", "write what this computer's chrony needs to lead the robots' time", _station_time,
             _station_time_arguments),
     Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments),
+    Command("Robots", "positions", "send the positioning system's positions to a robot, with proof", _positions,
+            _positions_arguments),
     Command("Robots", "fetch", "bring a robot's recorder files to this computer", _fetch, _fetch_arguments),
     Command("Robots", "convert", "make MCAP, CSV or MAT of files of a recorder", _convert, _convert_arguments),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments),

@@ -34,7 +34,7 @@ from flotilla.common.errors import UserError
 from flotilla.common.yaml_file import did_you_mean
 from flotilla.fleet import identity
 from flotilla.fleet.model import Fleet, Host, Robot
-from flotilla.station import station_keys
+from flotilla.station import sending
 from flotilla.station.authentication import Signer
 
 TASK = "drive"
@@ -197,7 +197,7 @@ class Driving:
         self._thread: threading.Thread | None = None
         self._socket: socket.socket | None = None
         if send is None:
-            self._socket = _socket(address)
+            self._socket = sending.bound(address)
             send = self._socket.sendto
         self._send = send
 
@@ -413,9 +413,8 @@ def _vehicle(fleet: Fleet, robot: Robot) -> Vehicle:
 def _signer(fleet: Fleet, address: str, vehicle: Vehicle) -> Signer | None:
     if not vehicle.signed:
         return None
-    keys = station_keys.shared(f"{vehicle.robot} would take no command")
     robot = next(each for each in fleet.robots.values() if each.name == vehicle.robot)
-    return Signer(keys.between(_station(fleet, vehicle, address), robot), vehicle.port)
+    return sending.signer(_station(fleet, vehicle, address), robot, vehicle.port, "command")
 
 
 def _station(fleet: Fleet, vehicle: Vehicle, address: str) -> Host:
@@ -432,17 +431,6 @@ def _station(fleet: Fleet, vehicle: Vehicle, address: str) -> Host:
             return station
     stations = ", ".join(f"{station.name} {station.address}" for station in fleet.stations)
     raise UserError(f"{address}: is no station's; {vehicle.robot} obeys {stations}; give this computer one's address")
-
-
-def _socket(address: str) -> socket.socket:
-    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    made.setblocking(False)
-    try:
-        made.bind((address, 0))
-    except OSError as error:
-        made.close()
-        raise UserError(f"{address}: {error.strerror}; give an address of this computer") from error
-    return made
 
 
 def _locked(directory: Path, robot: str, operator: Operator) -> IO[str]:

@@ -145,6 +145,7 @@ ELSEWHERE = {
         "serves until Ctrl-C; test_station_page.py in runtime and boot",
     ),
     "ssh -L 8080:127.0.0.1:8080 station": "needs a second computer",
+    "make positions ROBOT=1": "sends until Ctrl-C; runtime/test_positions.py has a robot by datagrams",
     **dict.fromkeys(
         ("make drive ROBOT=5", "make drive ROBOT=1 INVENTORY=build/wheeled/station KEYS=build/wheeled/keys"),
         "needs a robot on wheels; runtime/test_drive.py has one by datagrams",

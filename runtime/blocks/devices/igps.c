@@ -8,10 +8,10 @@
  * good ones, and `age` grows. Datagrams of another length or sender are counted in `refused` and change nothing. The
  * journal says once why there is no position.
  *
- * With `keys` each datagram carries 40 bytes more, which prove that it is the sender's and new. A datagram without a right
- * proof is not taken. It is counted in `refused` if it lacks the 40 bytes, in `forged` if they are wrong, and in
- * `replayed` if it came before. The first datagram after a start of either side is counted in `replayed`, too: the
- * sender is asked, with 40 bytes, to prove that its datagrams are new.
+ * With `keys` each datagram carries 40 bytes more, which prove that it is the sender's and new; `make positions` on a
+ * station appends them. A datagram without a right proof is not taken. It is counted in `refused` if it lacks the 40
+ * bytes, in `forged` if they are wrong, and in `replayed` if it came before. The first datagram after a start of either
+ * side is counted in `replayed`, too: the sender is asked, with 40 bytes, to prove that its datagrams are new.
  */
 #include "core/udp.h"
 #include "igps_datagram.h"
