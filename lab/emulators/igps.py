@@ -7,6 +7,7 @@ with Igps(("127.0.0.1", 5000), lambda seconds: (0.01 * seconds, 0.5), rate=40) a
 
 from __future__ import annotations
 
+import contextlib
 import math
 import random
 import socket
@@ -18,10 +19,14 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
 
+from flotilla.station.authentication import Signer
+
 Position = tuple[float, float]
 """x and y in m."""
 
 ByteOrder = Literal["little", "big"]
+
+_LONGEST = 2048
 
 
 def pack(position: Position, byte_order: ByteOrder = "little") -> bytes:
@@ -59,7 +64,9 @@ class Igps:
         byte_order: ByteOrder = "little",
         faults: Faults | None = None,
         seed: int = 0,
+        signer: Signer | None = None,
     ) -> None:
+        """`signer`: of positions to the destination; it proves bad ones, too."""
         self.faults = faults or Faults()
         """May be set at any time."""
         self.sent = 0
@@ -70,6 +77,7 @@ class Igps:
         self._jitter = jitter
         self._byte_order: ByteOrder = byte_order
         self._random = random.Random(seed)
+        self._signer = signer
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="igps")
 
@@ -114,8 +122,16 @@ class Igps:
                 if self._stop.wait(max(0.0, begin + due - time.monotonic())):
                     return
                 for datagram in datagrams:
-                    sender.sendto(datagram, self._destination)
+                    sender.sendto(self._signed(datagram, sender), self._destination)
                     self.sent += self._is_good(datagram)
+
+    def _signed(self, datagram: bytes, sender: socket.socket) -> bytes:
+        if not self._signer:
+            return datagram
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._signer.challenged(sender.recv(_LONGEST, socket.MSG_DONTWAIT))
+        return self._signer.sign(datagram)
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -13,6 +13,7 @@ import pytest
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from flotilla.station.authentication import Signer
+from lab.emulators.igps import Faults, Igps
 from tests.running import PATIENCE, Task, free_port, running, watching
 
 pytestmark = pytest.mark.clock
@@ -123,6 +124,20 @@ def test_igps_takes_positions_that_python_signs(started: Start) -> None:
         sender.send(taken)
         row = task.until(lambda row: row["replayed"] == 2)
         assert (row["position"], row["sequence"], row["refused"], row["forged"]) == ([4, 3], 1, 1, 1)
+
+
+def test_igps_takes_positions_of_the_emulator(started: Start) -> None:
+    """Bad ones, too: a signed NaN says that the system does not see the robot. Seen to fail with an emulator that takes
+    no challenges, and with one that signs good positions alone."""
+    port = free_port()
+    with (
+        started(POSITIONS, port, LOCATED) as task,
+        Igps(("127.0.0.1", port), lambda _: (1, 2), rate=100, signer=Signer(KEY.hex(), port)) as igps,
+    ):
+        assert task.until(lambda row: row["flag"])["position"] == [1, 2]
+        igps.faults = Faults(blind=1)
+        row = task.until(lambda row: not row["flag"])
+        assert (row["position"], row["refused"], row["forged"]) == ([1, 2], 0, 0)
 
 
 def test_a_block_signs_what_python_takes(started: Start) -> None:
