@@ -142,6 +142,7 @@ def _blocks(course: Course, described: Fleet, file: Path) -> dict[str, Any]:
                 told["every"] = slower
             wired = {port: _wire(wires[name], name, wire) for port, wire in told.get("in", {}).items()}
             told["in"] = {port: end for port, end in wired.items() if end is not None}
+            told.get("parameters", {}).pop("keys", None)  # nobody listens to its reports, or checks them
             blocks[f"{name}_{block}"] = told
     come = sorted([*datagrams(course.commands, course.seconds), *course.others], key=lambda each: each[0])
     file.write_bytes(b"".join(struct.pack("=d", at_s) + datagram for at_s, datagram in come))
