@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from flotilla.station import driving, receiver, telemetry
+from flotilla.station import driving, receiver, station_keys, telemetry
 from flotilla.station.authentication import Signer
 from flotilla.station.driving import RATE_HZ, Driving
 from lab.qemu.timing import Deadline
@@ -173,7 +173,7 @@ def test_the_boom_goes_out_and_in(there: Live, operator: Operator) -> None:
 
 def test_what_it_reports_reaches_a_station_on_this_computer(there: Live, operator: Operator) -> None:
     """As `make top` and others receive it: from the robot's address, by the inventory of the lab."""
-    heard = receiver.Receiver(telemetry.streams(there.fleet))
+    heard = receiver.Receiver(telemetry.streams(there.fleet), station_keys.of_telemetry(there.fleet))
     deadline = Deadline(PATIENCE_S)
     (here,) = receiver.listen([there.report_port], there.station_address)
     with here:
