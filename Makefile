@@ -289,9 +289,9 @@ top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS
 drive: | setup ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN] [INVENTORY=]
 	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT) $(call option,--inventory,INVENTORY)
 
-positions: | setup ## positions of the indoor positioning system to a robot, with proof: make positions ROBOT=3 [PORT=5010] [STATION=] [INVENTORY=]
-	$(Q)$(FLOTILLA) positions $(call need,ROBOT) $(call option,--port,PORT) $(call option,--station,STATION) \
-	    $(call option,--inventory,INVENTORY)
+positions: | setup ## positions of the indoor positioning system to a robot, with proof: make positions ROBOT=3 [PORT=5010] [INTERFACE=eth1] [STATION=] [INVENTORY=]
+	$(Q)$(FLOTILLA) positions $(call need,ROBOT) $(call option,--port,PORT) $(call option,--interface,INTERFACE) \
+	    $(call option,--station,STATION) $(call option,--inventory,INVENTORY)
 
 fetch: | setup ## recorder files of a robot's task: make fetch ROBOT=3 TASK=heading [OUT=directory]
 	$(Q)$(FLOTILLA) fetch $(call need,ROBOT) $(call need,TASK) $(call option,--out,OUT)

@@ -53,8 +53,6 @@ SILENT_S = 5.0
 APART_S = 1.2
 """From the last datagram of one hold to the first of the next: the robot takes two that speak within 1 s for a
 conflict (`guard.apart` of drive.yml)."""
-EVERYWHERE = "0.0.0.0"
-"""In place of one address of this computer."""
 _LONGEST = 2048
 _AT_ONCE = 100
 """Datagrams of robots that are taken in one tick."""
@@ -182,7 +180,7 @@ class Driving:
     def __init__(
         self,
         fleet: Fleet,
-        address: str = EVERYWHERE,
+        address: str = sending.EVERYWHERE,
         *,
         clock: Callable[[], float] = time.monotonic,
         send: Callable[[bytes, tuple[str, int]], object] | None = None,
@@ -419,9 +417,9 @@ def _signer(fleet: Fleet, address: str, vehicle: Vehicle) -> Signer | None:
 
 def _station(fleet: Fleet, vehicle: Vehicle, address: str) -> Host:
     """Which of the fleet's stations this computer is."""
-    if address == EVERYWHERE and len(fleet.stations) == 1:
+    if address == sending.EVERYWHERE and len(fleet.stations) == 1:
         return fleet.stations[0]
-    if address == EVERYWHERE:
+    if address == sending.EVERYWHERE:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # sends nothing
             with contextlib.suppress(OSError):
                 probe.connect((vehicle.address, vehicle.port))

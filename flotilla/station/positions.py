@@ -27,7 +27,7 @@ from flotilla.station.authentication import Signer
 PORT = 5010
 """Where positions are taken, unless another is named."""
 HERE = "127.0.0.1"
-"""The positioning system's program runs on this computer: nobody else can send to this address."""
+"""Where the positioning system's program sends if it runs on this computer: nobody else can send to this address."""
 BYTES = 16
 """Of a position: y and x as doubles."""
 _BLOCK = "igps"
@@ -110,13 +110,16 @@ def run(arguments: argparse.Namespace) -> None:
     there = receiver(fleet, robot, arguments.inventory)
     station = inventory.station(fleet, arguments.station, arguments.inventory)
     signer = sending.signer(station, robot, there.port, "position") if there.signed else None
+    from_ = sending.EVERYWHERE if arguments.interface else HERE
+    remedy = "end the program that has it, or take another port: PORT="
     with (
-        sending.bound(HERE, arguments.port, "end the program that has it, or take another port: PORT=") as taken,
+        sending.bound(from_, arguments.port, remedy, arguments.interface) as taken,
         sending.bound(str(station.address), remedy=f"give this computer {station.name}'s address") as sender,
         _stopped() as stopped,
     ):
         forwarder = Forwarder(taken, sender, (str(robot.address), there.port), signer)
-        print(f"positions from {HERE}:{arguments.port} to {robot.name}, until Ctrl-C", flush=True)
+        where = f"{arguments.interface or HERE}:{arguments.port}"
+        print(f"positions from {where} to {robot.name}, until Ctrl-C", flush=True)
         forwarder.run(stopped)
     print("; ".join(
         [f"{forwarder.sent} positions sent to {robot.name}", f"{forwarder.wrong} of a wrong length left out"]
@@ -141,5 +144,8 @@ def positions_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("robot", type=int, help="number in the inventory")
     parser.add_argument(
         "--port", type=int, default=PORT, help=f"UDP port of {HERE} that positions are sent to (%(default)s)"
+    )
+    parser.add_argument(
+        "--interface", default="", help="network interface that they come by (none: they come from this computer)"
     )
     cell.station_arguments(parser)

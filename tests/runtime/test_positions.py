@@ -60,11 +60,11 @@ def robot(fleet: Path, keys: dict[str, str], flotilla_run: Path, tmp_path: Path)
 class Forwarding:
     """The program, and the positioning system's before it."""
 
-    def __init__(self, process: subprocess.Popen[str], port: int) -> None:
+    def __init__(self, process: subprocess.Popen[str], port: int, where: str) -> None:
         self.process = process
         self._to = ("127.0.0.1", port)
         assert process.stdout
-        assert process.stdout.readline() == f"positions from 127.0.0.1:{port} to robot1, until Ctrl-C\n"
+        assert process.stdout.readline() == f"positions from {where}:{port} to robot1, until Ctrl-C\n"
 
     def send(self, datagram: bytes) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as system:
@@ -87,13 +87,14 @@ class Forwarding:
 
 
 @contextmanager
-def forwarding(fleet: Path, keys: dict[str, str]) -> Iterator[Forwarding]:
+def forwarding(fleet: Path, keys: dict[str, str], interface: str = "") -> Iterator[Forwarding]:
     port = free_port()
     options = ["1", "--port", str(port), "--inventory", str(fleet)]
+    options += ["--interface", interface] if interface else []
     argv = [sys.executable, "-m", "flotilla", "positions", *options]
     with subprocess.Popen(argv, cwd=paths.PROJECT, env=os.environ | keys, stdout=subprocess.PIPE, text=True) as process:
         try:
-            yield Forwarding(process, port)
+            yield Forwarding(process, port, interface or "127.0.0.1")
         finally:
             process.kill()
 
@@ -111,6 +112,14 @@ def test_positions_reach_the_robot_also_after_a_restart(robot: Task, fleet: Path
         program.end(signal.SIGTERM)
     assert again["sequence"] > row["sequence"]
     assert again["forged"] == 0
+
+
+def test_positions_come_by_one_interface(robot: Task, fleet: Path, keys: dict[str, str]) -> None:
+    """That of the loopback here. Seen to fail with a socket that is bound to another."""
+    with forwarding(fleet, keys, "lo") as program:
+        row = program.until(robot, 5, 6)
+        program.end(signal.SIGTERM)
+    assert row["position"] == [5, 6]
 
 
 def test_who_has_the_stations_address_alone_moves_no_robot(robot: Task, fleet: Path, keys: dict[str, str]) -> None:

@@ -71,5 +71,6 @@ def test_an_address_that_others_have_is_named(said: Said) -> None:
         port = other.getsockname()[1]
         complaint = said(1, "--port", str(port))
     assert f"127.0.0.1:{port}: Address already in use; end the program that has it, or take another" in complaint
+    assert "eth99: No such device; give a network interface of this computer" in said(1, "--interface", "eth99")
     (station,) = inventory.load_fleet(FLEET).stations
     assert f"{station.address}: Cannot assign requested address; give this computer station's" in said(1, "--port", "0")
