@@ -154,7 +154,7 @@ class View:
             "hz": round(row.rate_hz, 1), "lost": row.lost, "link": row.link, "age": row.age_s, "charge": row.charge,
             "silent": row.silent(stream), "came": count.received, "refused": count.bad,
             "bad": [name for name, share in row.flags.items() if name.endswith(HEALTH) and share < 1],
-            "refusals": row.refusals,
+            "refusals": row.refusals, "attempts": count.attempts,
             "values": {
                 each.name: _json(values[each.name])
                 for each in stream.fields

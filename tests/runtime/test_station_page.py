@@ -23,11 +23,12 @@ from typing import IO
 import pytest
 from websockets.exceptions import InvalidStatus
 
+from flotilla.station.authentication import TRAILER
 from tests.browser import Browser, Page
 from tests.figures import PROPERTY
 from tests.running import PATIENCE
 from tests.runtime.test_param import Running
-from tests.station import NEIGHBOUR, decoded, on_loopback, secret_in, station
+from tests.station import ADDRESS, NEIGHBOUR, decoded, on_loopback, secret_in, station
 from tests.station_page import Station, WheeledRobot, connected, until
 
 WHEELED = Path("lab/wheeled/inventory")
@@ -175,6 +176,15 @@ def test_what_was_refused_is_shown(page: Page) -> None:
     """By each task, and by the robot's firewall. Seen to fail without what the robot says beside its tasks."""
     for words in ("drive refused 410 forged by commands", "firewall dropped 14 packets of a flood"):
         page.until(f"document.querySelector('.robot .figures').textContent.includes('{words}')")
+
+
+def test_what_others_said_in_the_robots_name_is_shown(page: Page, robot: WheeledRobot) -> None:
+    """Seen to fail where the page does not name it."""
+    stream = robot.streams["drive"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((robot.address, 0))
+        other.sendto(bytes(stream.length + TRAILER), (ADDRESS, stream.port))
+    page.until("document.querySelector('.robot .figures').textContent.includes('drive report left out 1 forged')")
 
 
 def turning(robot: WheeledRobot, count: int) -> list[tuple[float, int, int, float, float, float, bool]]:

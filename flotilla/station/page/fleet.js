@@ -122,6 +122,10 @@ export class Fleet {
       const refusals = state.tasks[`${robot.name} ${name}`]?.refusals || (reported && state.streams[reported.topic].refusals);
       if (refusals) parts.push([name, `refused ${refusals}`, false]);
     }
+    for (const stream of own) {
+      const attempts = state.streams[stream.topic].attempts;
+      if (attempts) parts.push([`${stream.task} ${stream.name}`, `left out ${attempts}`, true]);
+    }
     for (const note of state.said[robot.name] ?? []) {
       const [label, ...words] = note.split(" ");
       parts.push([label, words.join(" "), true]);
