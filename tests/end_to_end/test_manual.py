@@ -153,8 +153,8 @@ ELSEWHERE = {
     **dict.fromkeys(
         (
             "make wheeled N=1 ROOM=corner",
-            "make top INVENTORY=build/wheeled/station",
-            "make record INVENTORY=build/wheeled/station",
+            "make top INVENTORY=build/wheeled/station KEYS=build/wheeled/keys",
+            "make record INVENTORY=build/wheeled/station KEYS=build/wheeled/keys",
         ),
         "runs until Ctrl-C; boot/test_wheeled_live.py boots the same",
     ),
