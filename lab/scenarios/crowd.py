@@ -93,7 +93,7 @@ def _loop(described: Fleet, loop: int, directory: str, keys: Path) -> tuple[list
             there[f"{directory}/{loop}-{name}.yml"] = task
             files.append((name, robot.name, f"{directory}/{loop}-{name}.yml"))
     tasks = [
-        {"name": f"{loop}/{name}", "computer": computer, "file": file, "credentials": f"{directory}/{computer}"}
+        {"name": f"{loop}-{name}", "computer": computer, "file": file, "credentials": f"{directory}/{computer}"}
         for name, computer, file in files
     ]
     return tasks, there
@@ -119,7 +119,7 @@ def measure(robots: int, board: Board, out: Path) -> Crowd:
     keys = out / "keys"
     keys.mkdir(parents=True, exist_ok=True)
     directory = virtual.run(files(robots, keys, board), board, out, {str(robots): SECONDS}, SHIFT) / str(robots)
-    loops = [Flight([], records(each, "steps"), []) for each in sorted(directory.glob("*/station"))]
+    loops = [Flight([], records(each, "steps"), []) for each in sorted(directory.glob("*-station"))]
     counts: dict[int, int] = {}
     for loop in loops:
         for us, count in loop.latency().histogram_us.items():

@@ -25,7 +25,7 @@ def test_each_loop_is_its_own(size: int, tmp_path: Path) -> None:
     assert len(flight["tasks"]) == 6 * loops
     assert {task["computer"] for task in flight["tasks"]} == {computer["name"] for computer in session["computers"]}
     said = {
-        loop: "".join(files[task["file"]].decode() for task in flight["tasks"] if task["name"].startswith(f"{loop}/"))
+        loop: "".join(files[task["file"]].decode() for task in flight["tasks"] if task["name"].startswith(f"{loop}-"))
         for loop in range(loops)
     }
     for pattern in (r"170\.160\.1\.\d+", r"/force\d", r"base: '0x\w+'"):
