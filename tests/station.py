@@ -112,14 +112,10 @@ class ProvenWay:
         self._to = (str(station.address), stream.port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((stream.address, 0))
-        self._socket.setblocking(False)
 
     def send(self, payload: bytes) -> bytes:
         """The message that was sent."""
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                with contextlib.suppress(ConnectionRefusedError):
-                    self.signer.challenged(self._socket.recv(100))
+        self.signer.hear(self._socket)
         message = self.signer.sign(payload)
         with contextlib.suppress(ConnectionRefusedError):
             self._socket.sendto(message, self._to)

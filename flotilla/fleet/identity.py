@@ -53,10 +53,7 @@ def dds_peers(fleet: Fleet, robot: Robot) -> list[str]:
 def _description(fleet: Fleet, robot: Robot) -> dict[str, object]:
     """What control tasks may use, besides `message` of transport.py."""
     board = fleet.boards[robot.board]
-    return {
-        "fleet": fleet, "network": fleet.network, "robot": robot, "board": board, "addresses": transport.addresses,
-        "keys": message_keys.CREDENTIAL,
-    }  # fmt: skip
+    return {"fleet": fleet, "network": fleet.network, "robot": robot, "board": board, "addresses": transport.addresses}
 
 
 def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import hmac
 import secrets
+import socket
 import struct
 
 from cryptography.exceptions import InvalidTag
@@ -14,6 +16,7 @@ _NUMBERS = struct.Struct("<QQQ")
 """Session, counter, and the answer or the challenge."""
 _TAG = 16
 _CHALLENGE = _NUMBERS.size + _TAG
+_AT_ONCE = 100
 TRAILER = _NUMBERS.size + _TAG
 """Bytes that a message has behind its payload."""
 
@@ -89,6 +92,13 @@ class Signer:
             return False
         self._challenged, self._answer = counter, challenge
         return True
+
+    def hear(self, one: socket.socket) -> None:
+        """Take the challenges that have come back to a socket, without waiting for any."""
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(_AT_ONCE):
+                with contextlib.suppress(ConnectionRefusedError):  # nobody listened to an earlier message
+                    self.challenged(one.recv(_CHALLENGE + 1, socket.MSG_DONTWAIT))
 
 
 class Verifier:

@@ -9,9 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import select
-import signal
 import socket
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +21,7 @@ from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.station import cell, sending
 from flotilla.station.authentication import Signer
+from flotilla.station.receiver import stopped
 
 PORT = 5010
 """Where positions are taken, unless another is named."""
@@ -115,29 +114,16 @@ def run(arguments: argparse.Namespace) -> None:
     with (
         sending.bound(from_, arguments.port, remedy, arguments.interface) as taken,
         sending.bound(str(station.address), remedy=f"give this computer {station.name}'s address") as sender,
-        _stopped() as stopped,
+        stopped() as ended,
     ):
         forwarder = Forwarder(taken, sender, (str(robot.address), there.port), signer)
         where = f"{arguments.interface or HERE}:{arguments.port}"
         print(f"positions from {where} to {robot.name}, until Ctrl-C", flush=True)
-        forwarder.run(stopped)
+        forwarder.run(ended)
     print("; ".join(
         [f"{forwarder.sent} positions sent to {robot.name}", f"{forwarder.wrong} of a wrong length left out"]
         + [f"{count} not sent: {reason}" for reason, count in forwarder.failed.items()]
     ))  # fmt: skip
-
-
-@contextlib.contextmanager
-def _stopped() -> Iterator[int]:
-    """A file descriptor that is readable from SIGINT or SIGTERM on."""
-    wake, waker = socket.socketpair()
-    with wake, waker:
-        waker.setblocking(False)
-        signal.set_wakeup_fd(waker.fileno())
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: None)
-        yield wake.fileno()
-        signal.set_wakeup_fd(-1)
 
 
 def positions_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,7 +11,7 @@ import signal
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
@@ -170,29 +170,38 @@ def receive(
     """
     readers = dict(others)
     by_fd = {one.fileno(): one for one in sockets}
-    wake, waker = socket.socketpair()
-    waker.setblocking(False)
-    signal.set_wakeup_fd(waker.fileno())
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: None)
     end = time.monotonic() + (seconds if seconds is not None else float("inf"))
     refreshed = time.monotonic()
-    while (now := time.monotonic()) < end:
-        ready, _, _ = select.select([wake.fileno(), *by_fd, *readers], [], [], min(end - now, REFRESH_S))
-        if wake.fileno() in ready:
-            break
-        for fd in ready:
-            if fd in by_fd:
-                drain(by_fd[fd], receiver)
-            elif not readers[fd]():
-                del readers[fd]
-        if time.monotonic() - refreshed >= REFRESH_S:
-            receiver.refresh()
-            refreshed = time.monotonic()
-            if note:
-                note(f"{sum(count.received for count in receiver.counts.values())} messages")
+    with stopped() as wake:
+        while (now := time.monotonic()) < end:
+            ready, _, _ = select.select([wake, *by_fd, *readers], [], [], min(end - now, REFRESH_S))
+            if wake in ready:
+                break
+            for fd in ready:
+                if fd in by_fd:
+                    drain(by_fd[fd], receiver)
+                elif not readers[fd]():
+                    del readers[fd]
+            if time.monotonic() - refreshed >= REFRESH_S:
+                receiver.refresh()
+                refreshed = time.monotonic()
+                if note:
+                    note(f"{sum(count.received for count in receiver.counts.values())} messages")
     for one in sockets:  # what came before the end
         drain(one, receiver)
+
+
+@contextlib.contextmanager
+def stopped() -> Iterator[int]:
+    """A file descriptor that is readable from SIGINT or SIGTERM on."""
+    wake, waker = socket.socketpair()
+    with wake, waker:
+        waker.setblocking(False)
+        signal.set_wakeup_fd(waker.fileno())
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: None)
+        yield wake.fileno()
+        signal.set_wakeup_fd(-1)
 
 
 def drain(one: socket.socket, receiver: Receiver) -> None:

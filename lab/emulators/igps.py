@@ -7,7 +7,6 @@ with Igps(("127.0.0.1", 5000), lambda seconds: (0.01 * seconds, 0.5), rate=40) a
 
 from __future__ import annotations
 
-import contextlib
 import math
 import random
 import socket
@@ -25,8 +24,6 @@ Position = tuple[float, float]
 """x and y in m."""
 
 ByteOrder = Literal["little", "big"]
-
-_LONGEST = 2048
 
 
 def pack(position: Position, byte_order: ByteOrder = "little") -> bytes:
@@ -128,9 +125,7 @@ class Igps:
     def _signed(self, datagram: bytes, sender: socket.socket) -> bytes:
         if not self._signer:
             return datagram
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                self._signer.challenged(sender.recv(_LONGEST, socket.MSG_DONTWAIT))
+        self._signer.hear(sender)
         return self._signer.sign(datagram)
 
     def __enter__(self) -> Self:

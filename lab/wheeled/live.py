@@ -292,10 +292,7 @@ class Live:
             (robot,) = (one.robot for one in self.robots if one.robot.name == name)
             key = message_keys.read().between(robot, self.fleet.stations[0])
             signer = self._signers[name, port] = Signer(key, port)
-        with suppress(BlockingIOError):
-            while True:
-                with suppress(ConnectionRefusedError):  # nobody listened to an earlier report
-                    signer.challenged(forward.recv(_LONGEST))
+        signer.hear(forward)
         with suppress(ConnectionRefusedError):
             forward.sendto(signer.sign(message[:-TRAILER]), (self.station_address, port))
 
@@ -345,7 +342,6 @@ def robots(
             stack.callback(commands.close)
             forward = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             forward.bind((address, 0))
-            forward.setblocking(False)
             cable = Cable(wire, station, functools.partial(live.heard, robot.name, commands, forward))
             stack.callback(cable.close)
             port = segment.ssh_port(robot.address)

@@ -106,7 +106,7 @@ def test_the_table_says_it() -> None:
                 receiver.take(message, STREAM.address, (STATION, STREAM.port), now_ns)
     receiver.take(b"short", other.address, (STATION, other.port), now_ns)
     receiver.take(message, STREAM.address, (STATION, STREAM.port), now_ns)
-    receiver.take(message[:-1] + b"?", STREAM.address, (STATION, STREAM.port), now_ns)
+    receiver.take(message[:-1] + bytes([message[-1] ^ 1]), STREAM.address, (STATION, STREAM.port), now_ns)
     receiver.take(message, STREAM.address, (LOOPBACK, STREAM.port), now_ns)
     receiver.take(message, "10.42.0.9", (STATION, STREAM.port), now_ns)
     assert [" ".join(line.split()) for line in top.end().splitlines()] == [
