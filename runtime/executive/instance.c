@@ -9,12 +9,14 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-/* Who holds a lock on this file; 1 where the kernel does not say. */
+enum { FIRST_LOGIN = 1000 };
+
+/* Who holds a lock for writing on this file; 0 for nobody, 1 where the kernel does not say. */
 static int holder(const struct stat *file)
 {
     char line[256];
-    int found = 1;
     FILE *locks = fopen("/proc/locks", "re");
+    int found = locks ? 0 : 1;
     while (locks && fgets(line, sizeof line, locks)) {
         int process;
         unsigned long inode;
@@ -27,15 +29,44 @@ static int holder(const struct stat *file)
     return found;
 }
 
+static bool may_log_in(unsigned user)
+{
+    return user == 0 || user >= FIRST_LOGIN;
+}
+
+/* Whether the lock of a process counts, by its user. The file says it, because /proc/PID itself belongs to root
+ * where the process wants that. */
+static bool counts(int process)
+{
+    char line[256];
+    unsigned user;
+    bool counted = may_log_in(geteuid());
+    snprintf(line, sizeof line, "/proc/%d/status", process);
+    FILE *status = fopen(line, "re");
+    while (status && fgets(line, sizeof line, status)) {
+        if (sscanf(line, "Uid: %u", &user) == 1)
+            counted = counted || may_log_in(user) || user == geteuid();
+    }
+    if (status)
+        fclose(status);
+    return counted;
+}
+
 int instance_lock(const char *path)
 {
     struct stat file;
     int fd = open(path, O_RDONLY | O_CLOEXEC);
     if (fd < 0 || fstat(fd, &file) < 0)
         return -1;
-    if (flock(fd, LOCK_EX | LOCK_NB) == 0)
-        return 0; /* held by the open descriptor */
-    int process = errno == EWOULDBLOCK ? holder(&file) : -1;
+    for (int i = 0; i < 2; i++) { /* who had it may have ended before it was looked at */
+        if (flock(fd, LOCK_EX | LOCK_NB) == 0)
+            return 0; /* held by the open descriptor */
+        int process = errno == EWOULDBLOCK ? holder(&file) : -1;
+        if (process < 0 || counts(process)) {
+            close(fd);
+            return process;
+        }
+    }
     close(fd);
-    return process;
+    return 0;
 }
