@@ -149,7 +149,8 @@ def test_a_block_signs_what_python_takes(started: Start) -> None:
             first, sender = receiver.recvfrom(100)
             session, counter, answer = NUMBERS.unpack(first[len(PAYLOAD) :][: NUMBERS.size])
             assert (first, counter, answer) == (message(port, session, 1, 0), 1, 0)
-            receiver.sendto(challenge(port, session, counter, 42)[:-1] + b"?", sender)
+            *forged, last = challenge(port, session, counter, 42)
+            receiver.sendto(bytes([*forged, last ^ 1]), sender)
             receiver.sendto(challenge(port, session, counter, 4711), sender)
             before = 1
             for _ in range(100):
