@@ -15,6 +15,7 @@ import glob
 import hashlib
 import json
 import os
+import pwd
 import re
 import signal
 import socket
@@ -337,6 +338,7 @@ def main() -> None:
         "hostname": socket.gethostname(),
         "machine": os.uname().machine,
         "uarts": [f"ttyS{number}" for number in uarts],
+        "users": [each.pw_name for each in pwd.getpwall()],
         "addresses": addresses,
         "firewall_is_loaded": firewall_is_loaded(),
         "sysctl": sysctl_drift(),

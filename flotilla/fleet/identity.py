@@ -105,7 +105,9 @@ def render(fleet: Fleet, robot: Robot, built: Sequence[BuiltApp] = ()) -> dict[P
     if [app.name for app in built] != robot.apps:  # a defect of the caller's: a card would lack them without a word
         raise ValueError(f"{robot.name} has the apps {robot.apps}, not {[app.name for app in built]}")
 
-    values = variables(fleet, robot)
+    tasks = _control_tasks(fleet, robot)
+    descriptions = {name: description for name, (_, description) in tasks.items()}
+    values = variables(fleet, robot) | {"device_users": privileges.device_users(descriptions)}
     files = {}
     for template in sorted(paths.OVERLAY.rglob("*.j2")):
         name = PurePosixPath(template.relative_to(paths.OVERLAY))
@@ -119,11 +121,12 @@ def render(fleet: Fleet, robot: Robot, built: Sequence[BuiltApp] = ()) -> dict[P
                 raise UserError(f"{paths.shown(template)}: {error}") from error
             if content.strip():
                 files[PurePosixPath("/") / path] = (content, _PRIVATE.get(template.name, 0o644))
-    for task_name, (task, description) in _control_tasks(fleet, robot).items():
+    for number, (task_name, (task, description)) in enumerate(tasks.items()):
         files[TASKS / f"{task_name}.yml"] = (task, 0o644)
+        drop_ins = apps.SYSTEM / f"flotilla-task@{task_name}.service.d"
+        files[drop_ins / privileges.USER_DROP_IN] = (privileges.user(number, description).encode(), 0o644)
         if privileges.drives_io_ports(description):
-            drop_in = apps.SYSTEM / f"flotilla-task@{task_name}.service.d" / privileges.DROP_IN
-            files[drop_in] = (privileges.IO_PORTS.encode(), 0o644)
+            files[drop_ins / privileges.DROP_IN] = (privileges.IO_PORTS.encode(), 0o644)
     return files | apps.listings(built)
 
 
@@ -139,8 +142,10 @@ def _control_tasks(fleet: Fleet, robot: Robot) -> dict[str, tuple[bytes, object]
     tasks = {name: _task(name, values | {"message": functools.partial(message, name)}) for name in robot.control_tasks}
     parsed = {name: _parsed(task) for name, task in tasks.items()}
     problems = []
+    shared_devices = list(privileges.shared_devices(parsed))
     for name, description in parsed.items():
         found = [
+            *(problem for task, problem in shared_devices if task == name),
             *_problems_of_processor(description, fleet.boards[robot.board]),
             *interfaces.problems(description, fleet, robot),
             *transport.problems(fleet, name, description),

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from flotilla.fleet.model import Fleet, Robot
+from flotilla.fleet.privileges import CAN_BLOCKS
 
-_CAN_BLOCKS = ("can-receive", "can-send", "epos2")
-"""Blocks on a CAN interface, `can0` unless they say another."""
 _UDP_BLOCKS = ("udp-receive", "udp-send")
 """Blocks on any interface unless they name one."""
 
@@ -20,11 +19,11 @@ def problems(description: object, fleet: Fleet, robot: Robot) -> Iterator[str]:
     blocks = description.get("blocks") if isinstance(description, dict) else None
     for name, block in blocks.items() if isinstance(blocks, dict) else ():
         kind = block.get("type") if isinstance(block, dict) else None
-        if kind not in (*_CAN_BLOCKS, *_UDP_BLOCKS):
+        if kind not in (*CAN_BLOCKS, *_UDP_BLOCKS):
             continue
         parameters = block.get("parameters")
         interface = parameters.get("interface") if isinstance(parameters, dict) else None
-        if kind in _CAN_BLOCKS:
+        if kind in CAN_BLOCKS:
             used = interface or "can0"
             if used not in robot.can:
                 others = f"{' or '.join(robot.can)}, or " if robot.can else ""

@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from flotilla.common import cache, paths
 from flotilla.common.errors import Problem, ProblemsError, UserError
 from flotilla.common.yaml_file import SYNTAX, Entry, Loc, child, compose, did_you_mean, dotted, explained, pairs
-from flotilla.fleet import apps, messages
+from flotilla.fleet import apps, messages, privileges
 from flotilla.fleet.model import Board, Fleet, Health, Host, Label, Network, Releases, Robot
 
 Finding = tuple[Loc, str, str]
@@ -505,6 +505,8 @@ def _tasks(raw: dict[str, Any]) -> Iterator[Finding]:
         named = _named(raw, name, "control_tasks")
         for loc, task, _ in _again(named.items()):
             yield loc, f"{task} is listed already", "each task once"
+        if len(named) > privileges.MOST_TASKS:
+            yield ("robots", name, "control_tasks"), f"has {len(named)} tasks", f"{privileges.MOST_TASKS} at most"
         for loc, task in named.items():
             if task not in there:
                 yield loc, f"there is no file {paths.shown(paths.TASKS)}/{task}.yml", f"one of {', '.join(there)}"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flotilla.fleet import privileges
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Fleet, Health, Robot
 from flotilla.robot import provision
@@ -54,6 +55,7 @@ def wanted(fleet: Fleet, robot: Robot) -> dict[str, Any]:
         "subnet": str(fleet.network.subnet),
         "machine": board.machine,
         "uarts": sorted(port.tty for port in board.ports.values() if port.tty.startswith("ttyS")),
+        "users": privileges.task_users(len(robot.control_tasks)),
     }
 
 

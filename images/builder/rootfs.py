@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from flotilla.common import cache, namespace, paths, progress, together
+from flotilla.fleet import privileges
 from flotilla.fleet.model import Board
 from images.builder import deb, debian_kernel, initramfs, kernel, pool, runtime, tools
 from images.builder.chroot import Chroot, mount
@@ -61,6 +62,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
         debian_kernel.PACKER,
         board.model_dump_json(include={"disk_modules", "architecture", "console"}),
         _DATA,
+        json.dumps(privileges.USERS),
         *sources,
         *_overlay_files(),
     )
@@ -336,15 +338,15 @@ def _lay_overlay(target: Path) -> None:
 def _configure(stage: Stage, console: str) -> None:
     """Accounts, services, the console's log-in and mount points: what the overlay's files cannot say by themselves."""
     stage.in_target("groupadd", "--system", "realtime")
-    # Whom control tasks and apps run as: numbers of their own, because the data partition outlives releases.
-    for name, number in (("control", "901"), ("app", "902")):
+    # Whom control tasks and apps run as.
+    for name, number in privileges.USERS.items():
         stage.in_target(
-            "useradd", "--system", "--uid", number, "--user-group", "--no-create-home", "--home-dir", "/nonexistent",
-            "--shell", "/usr/sbin/nologin", name,
+            "useradd", "--system", "--uid", str(number), "--user-group", "--no-create-home",
+            "--home-dir", "/nonexistent", "--shell", "/usr/sbin/nologin", name,
         )  # fmt: skip
     stage.in_target(
         "useradd", "--uid", "1000", "--user-group", "--no-create-home", "--home-dir", "/home/robot",
-        "--shell", "/bin/bash", "--groups", "dialout,video,realtime,control,app", "robot",
+        "--shell", "/bin/bash", "--groups", ",".join(["dialout,video,realtime", *privileges.USERS]), "robot",
     )  # fmt: skip
     stage.in_target("systemctl", "preset-all", "--preset-mode=full")
     stage.in_target("systemctl", "set-default", "multi-user.target")

@@ -31,7 +31,7 @@ import yaml
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import inventory, message_keys
+from flotilla.fleet import identity, inventory, message_keys, privileges
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.station import telemetry
 from flotilla.station.authentication import TRAILER, Signer
@@ -63,17 +63,18 @@ _SENDERS = 16
 """Programs that command one robot, of which answers find back."""
 _THERE = "/home/robot/plant"
 """What is brought into a guest."""
-_BEGIN = f"""
+_BEGIN = """
 set -e
-mkdir -p {Path(LASER).parent}
-chown control {Path(LASER).parent}
-until ip link show {DRIVES} >/dev/null 2>&1; do sleep 0.2; done
-ip link set {DRIVES} up type can bitrate {BITRATE} restart-ms 100
-systemd-run --quiet --unit=plant -p User=control -p SupplementaryGroups='dialout realtime robot' -p LimitRTPRIO=99 \\
-    -p LimitMEMLOCK=infinity -p WorkingDirectory={_THERE} flotilla-run --blocks {_THERE} {_THERE}/plant.yml
+mkdir -p {devices}
+chown {user} {devices}
+until ip link show {drives} >/dev/null 2>&1; do sleep 0.2; done
+ip link set {drives} up type can bitrate {bitrate} restart-ms 100
+systemd-run --quiet --unit=plant -p User={user} -p SupplementaryGroups='dialout realtime robot' -p LimitRTPRIO=99 \\
+    -p LimitMEMLOCK=infinity -p WorkingDirectory={there} flotilla-run --blocks {there} {there}/plant.yml
 systemd-run --quiet --unit=busy -p CPUSchedulingPolicy=idle sh -c 'while :; do :; done'
 """
-"""The plant makes the laser's terminal, so it runs as control tasks do; its files are in the folder of user `robot`.
+"""The plant makes the laser's terminal, so it runs as the user of the control task that opens it; its files are in the
+folder of user `robot`.
 
 Both boards are the kernel's to find; only the first is in the inventory, so nobody else sets the second up.
 
@@ -375,7 +376,10 @@ def _bring(live: Live, fleet: Fleet, index: int, there: Plant) -> None:
         one.shell.run(["mkdir", "-p", _THERE])
         one.shell.write(f"{_THERE}/plant.so", runtime.compile_plugin(PLANT, board.system))
         one.shell.write(f"{_THERE}/plant.yml", yaml.safe_dump(task).encode())
-        one.shell.run(["sudo", "sh", "-c", _BEGIN], timeout=BEGIN_SECONDS)
+        tasks = {name: yaml.safe_load(text) for name, text in identity.control_tasks(fleet, one.robot).items()}
+        user = privileges.device_users(tasks)[Path(LASER).name]
+        begin = _BEGIN.format(user=user, devices=Path(LASER).parent, there=_THERE, drives=DRIVES, bitrate=BITRATE)
+        one.shell.run(["sudo", "sh", "-c", begin], timeout=BEGIN_SECONDS)
         live.until(lambda: live.truth(index) and live.report(index).get("seeing"), BEGIN_SECONDS, "the plant begins")
 
 

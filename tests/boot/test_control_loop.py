@@ -21,7 +21,7 @@ import yaml
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity
+from flotilla.fleet import identity, privileges
 from flotilla.fleet.model import Fleet
 from flotilla.fleet.transport import duration_s
 from flotilla.robot import parameters, scope, ssh
@@ -37,18 +37,19 @@ from tests.conftest import RobotGuest
 UNIT = "flotilla-task@heading.service"
 TASK = paths.TASKS / "heading.yml"
 INERTIA_KG_M2 = 0.25
-CONTROL, APP = 901, 902
-"""Users of control tasks and of apps."""
+TASK_USER, OTHER_TASK, APP = (privileges.USERS[name] for name in ("control1", "control2", "app"))
+"""Users of the task, of a second one, and of apps."""
 SECONDS = 120
 DDS_SECURITY = "/etc/flotilla/dds-security.xml"
-OWN_TASKS = {
+OWN = {
     "kill -0 {target}",
     "flotilla-param heading attitude.kp",
     "ls /var/lib/flotilla/heading",
     "head -c 1 /run/credentials/flotilla-task@heading.service/message-keys",
+    "test -r /dev/robot/gyro",
 }
-"""What control tasks may do to each other, which run as one user."""
-ATTEMPTS = OWN_TASKS | {
+"""What a control task may do to itself."""
+ATTEMPTS = OWN | {
     "cat /proc/{target}/environ",
     "head -c 1 /etc/flotilla/message-keys",
     "head -c 1 /etc/chrony/chrony.keys",
@@ -253,7 +254,7 @@ def test_the_task_has_only_the_privileges_it_needs(loop: Loop) -> None:
         cap_sys_rawio = 1 << 17
         for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"):
             assert int(fields[name], 16) == cap_sys_rawio, name
-        assert fields["Uid"].split() == [str(CONTROL)] * 4
+        assert fields["Uid"].split() == [str(TASK_USER)] * 4
         assert fields["NoNewPrivs"].strip() == "1"
         assert "VmLck" in fields
         assert not fields["VmLck"].startswith("       0"), "memory is not locked"
@@ -274,19 +275,21 @@ def attempted(loop: Loop, target: int, *user: str) -> set[str]:
 
 def test_who_takes_over_a_task_or_an_app_takes_over_nothing_else(loop: Loop) -> None:
     """With a task's user and groups. Seen to fail as user `robot`, whom tasks once ran as: it could write to the
-    operator's home folder, from which the next shell takes commands, and signal sshd."""
+    operator's home folder, from which the next shell takes commands, and signal sshd; and as `control`, whom all tasks
+    once ran as: one could signal, tune and read another."""
 
     def takes_over(pid: int) -> None:
         status = loop.robot.shell.run(["cat", f"/proc/{pid}/status"]).stdout
         (found,) = re.findall(r"^Groups:\t(.*)$", status, re.MULTILINE)
 
         def as_user(number: int) -> list[str]:
-            groups = [each for each in found.split() if each != str(CONTROL)] + [str(number)]
+            groups = [each for each in found.split() if each != str(TASK_USER)] + [str(number)]
             own = [f"--reuid={number}", f"--regid={number}", f"--groups={','.join(groups)}"]
             return ["setpriv", *own, "--bounding-set=-all", "--no-new-privs"]
 
         assert attempted(loop, pid) == set(ATTEMPTS), "root may, so these are attempts"
-        assert attempted(loop, pid, *as_user(CONTROL)) == OWN_TASKS
+        assert attempted(loop, pid, *as_user(TASK_USER)) == OWN
+        assert attempted(loop, pid, *as_user(OTHER_TASK)) == set()
         assert attempted(loop, pid, *as_user(APP)) == set()
 
     loop.of_one_process(takes_over)
@@ -406,7 +409,7 @@ def test_dds_proves_who_the_robot_is(loop: Loop, fleet: Fleet) -> None:
     assert len(brought) == len(names)
     write = [f"mkdir -p {Path(path).parent}; cat >{path} <<'END'\n{text}END" for path, text in brought.items()]
     restart = f"systemctl daemon-reload; systemctl reset-failed {UNIT}; systemctl restart {UNIT}"
-    user = f"prlimit --rtprio=99 setpriv --reuid={CONTROL} --regid={CONTROL} --clear-groups"
+    user = f"prlimit --rtprio=99 setpriv --reuid={TASK_USER} --regid={TASK_USER} --clear-groups"
     ask = f"""
     export "$(tr '\\0' '\\n' </proc/$pid/environ | grep ^CYCLONEDDS_URI=)"
     {user} ddsperf -i {network.dds_domain} -D 600 sub >/dev/null 2>&1 &

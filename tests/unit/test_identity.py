@@ -13,7 +13,7 @@ import yaml
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity, message_keys
+from flotilla.fleet import identity, message_keys, privileges
 from flotilla.fleet.inventory import load_fleet
 from flotilla.fleet.model import Acceptance, Device, Fleet, Ibss, IsaResources, Robot
 from flotilla.station import telemetry
@@ -65,6 +65,48 @@ def test_only_what_drives_io_ports_may(transport: str) -> None:
     shared = (paths.PROJECT / "runtime" / "systemd" / "flotilla-control@.service.in").read_text().splitlines()
     assert "CapabilityBoundingSet=" in shared
     assert not any(line.startswith("AmbientCapabilities") for line in shared)
+
+
+def test_control_tasks_have_users_of_their_own_and_their_devices_alone(fleet: Fleet) -> None:
+    """Seen to fail with the groups of all devices for each, and with AF_CAN for all."""
+    wheeled = load_fleet(paths.PROJECT / "lab" / "wheeled" / "inventory")
+    (robot,) = wheeled.robots.values()
+    for number, (task, can) in enumerate({"drive": True, "perceive": False}.items()):
+        assert robot.control_tasks[number] == task
+        lines = _text(wheeled, robot, f"/etc/systemd/system/flotilla-task@{task}.service.d/user.conf").splitlines()
+        assert f"User=control{number + 1}" in lines
+        assert "SupplementaryGroups=realtime control" in lines, "no dialout, no video"
+        assert ("RestrictAddressFamilies=~AF_CAN" in lines) is not can
+    rules = [_text(fleet, fleet.robots[number], "/etc/udev/rules.d/70-robot.rules") for number in (1, 3)]
+    gyro, of_no_task = (next(line for line in text.splitlines() if "robot/gyro" in line) for text in rules)
+    assert 'OWNER="control1"' in gyro
+    assert "OWNER" not in of_no_task
+
+
+@pytest.mark.parametrize(
+    ("block", "groups", "can"),
+    [
+        ({"type": "epos2"}, "realtime control", True),
+        ({"type": "can-send", "parameters": {"interface": "can1"}}, "realtime control", True),
+        ({"type": "dsp3000", "parameters": {"device": "/dev/robot/gyro"}}, "realtime control", False),
+        ({"type": "dsp3000", "parameters": {"device": "/dev/ttyS5"}}, "realtime control dialout", False),
+        ({"type": "frame-grabber-v4l2"}, "realtime control video", False),
+        ({"type": "frame-grabber-iidc", "parameters": None}, "realtime control video", False),
+    ],
+)
+def test_a_task_gets_what_its_blocks_need(block: dict[str, Any], groups: str, can: bool) -> None:
+    """Seen to fail with each of the groups left out."""
+    lines = privileges.user(15, {"blocks": {"any": block}}).splitlines()
+    assert "User=control16" in lines
+    assert f"SupplementaryGroups={groups}" in lines
+    assert ("RestrictAddressFamilies=~AF_CAN" in lines) is not can
+
+
+def test_a_device_of_two_tasks_is_an_error() -> None:
+    tasks = {name: {"blocks": {"any": {"parameters": {"device": "/dev/robot/gyro"}}}} for name in ("first", "second")}
+    ((task, problem),) = privileges.shared_devices(tasks)
+    assert task == "second"
+    assert "/dev/robot/gyro is open in first too: read it in one task" in problem
 
 
 def test_a_task_talks_to_the_one_robot_that_has_the_other(fleet: Fleet) -> None:

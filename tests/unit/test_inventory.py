@@ -204,6 +204,14 @@ CASES = {
     "health misspelt": Case(
         ALL, "overruns_percent: 1", "overrun_percent: 1", "health.overrun_percent", "mean overruns_percent"
     ),
+    "tasks without users": Case(
+        ROBOTS,
+        "[heading]",
+        f"[{', '.join(['heading'] * 17)}]",
+        "robot1.control_tasks",
+        "has 17 tasks…16 at most",
+        also=16,
+    ),
     "task twice": Case(ROBOTS, "[heading]", "[heading, heading]", "robot1.control_tasks.1", "already…once", "heading"),
     "stands by for a task it has not": Case(
         ROBOTS,

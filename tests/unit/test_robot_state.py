@@ -86,6 +86,17 @@ def test_a_computer_of_another_kind_is_refused(board: str, machine: str, right: 
     assert all(language.compile_expression(each)(robot=robot) for each in judged) is right
 
 
+@pytest.mark.parametrize(("there", "right"), [(["root", "control1", "control2"], True), (["root", "control"], False)])
+def test_a_release_without_users_of_tasks_is_refused(there: list[str], right: bool) -> None:
+    """Seen to fail without the condition: its tasks would not start."""
+    (play,) = yaml.safe_load((ANSIBLE / "fleet.yml").read_text())
+    (judged,) = (task["ansible.builtin.assert"]["that"] for task in play["pre_tasks"] if "users" in task["name"])
+    language = jinja2.Environment()
+    language.tests |= CoreTests().tests() | SetTests().tests()
+    robot = {"state": {"users": there}, "wanted": {"users": ["control1", "control2"]}}
+    assert language.compile_expression(judged)(robot=robot) is right
+
+
 PARAM = """#!/bin/sh
 [ "$*" = "--status=json heading" ] || {{ echo "flotilla-param: no task runs here" >&2; exit 1; }}
 echo . >>{directory}/calls

@@ -3,10 +3,14 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <grp.h>
 #include <inttypes.h>
 #include <limits.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <time.h>
+#include <unistd.h>
 
 /* Locks on bytes of a queue record who uses it; the kernel drops them with the process, however it ends. There is one
  * for each end, and one that is held while a queue is opened or closed, so that this happens one at a time. A mqd_t of
@@ -86,14 +90,40 @@ static enum opened settle(struct queue *queue, struct fl_block *block, enum queu
     return OPENED;
 }
 
+/* Tasks of a robot have users of their own, so their queues are of a group that all are in. Whose queue it is not may
+ * not change it, and need not. */
+static void share(mqd_t descriptor)
+{
+    const char *name = getenv("FLOTILLA_QUEUE_GROUP");
+    const struct group *group = name ? getgrnam(name) : NULL;
+    if (group)
+        (void)!fchown(descriptor, (uid_t)-1, group->gr_gid);
+}
+
+/* Another task may have made the queue just now, and not yet have shared it. */
+static mqd_t open_shared(const char *name, struct mq_attr *wanted)
+{
+    enum { TRIES = 50, PAUSE_NS = 1000000 };
+    mqd_t descriptor = -1;
+    for (int i = 0; i < TRIES; i++) {
+        descriptor = mq_open(name, O_RDWR | O_CREAT | O_NONBLOCK | O_CLOEXEC, 0660, wanted);
+        if (descriptor >= 0 || errno != EACCES)
+            break;
+        nanosleep(&(struct timespec){.tv_nsec = PAUSE_NS}, NULL);
+        errno = EACCES;
+    }
+    return descriptor;
+}
+
 static enum opened open_once(struct queue *queue, struct fl_block *block, enum queue_end end, int64_t depth)
 {
     struct mq_attr wanted = {.mq_maxmsg = (long)depth, .mq_msgsize = (long)queue->message_bytes};
-    queue->descriptor = mq_open(queue->name, O_RDWR | O_CREAT | O_NONBLOCK | O_CLOEXEC, 0660, &wanted);
+    queue->descriptor = open_shared(queue->name, &wanted);
     if (queue->descriptor < 0) {
         fail_to_open(block, queue, depth);
         return FAILED;
     }
+    share(queue->descriptor);
     enum opened opened = FAILED;
     if (!lock(queue->descriptor, LOCK_CHANGE, 1, F_WRLCK, true))
         fl_fail(block, "queue %s cannot be locked: %s", queue->name, strerror(errno));

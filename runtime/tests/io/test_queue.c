@@ -6,6 +6,7 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <grp.h>
 #include <linux/capability.h>
 #include <math.h>
 #include <pthread.h>
@@ -349,6 +350,30 @@ static void makes_anew_what_is_being_removed(void **state)
     assert_gone();
 }
 
+/* With a group that this process is in, or root, which may give it any. Seen to fail without the variable. */
+static void is_of_the_group_that_tasks_share(void **state)
+{
+    (void)state;
+    gid_t groups[64], wanted = 1;
+    struct stat file;
+    int count = getgroups(64, groups);
+    for (int i = 0; i < count && geteuid() != 0; i++)
+        wanted = groups[i];
+    struct group *group = getgrgid(wanted);
+    assert_non_null(group);
+    setenv("FLOTILLA_QUEUE_GROUP", group->gr_name, 1);
+    struct fl_block *send = testbed_block("queue-send", "name", name, NULL);
+    assert_int_equal(send->type->start(send), FL_OK);
+    unsetenv("FLOTILLA_QUEUE_GROUP");
+    mqd_t made = open_queue(O_RDWR, 0, 0);
+    assert_true(made >= 0);
+    assert_int_equal(fstat(made, &file), 0);
+    assert_int_equal(file.st_gid, wanted);
+    mq_close(made);
+    testbed_end(send);
+    assert_gone();
+}
+
 static void refuses(void **state)
 {
     (void)state;
@@ -414,6 +439,7 @@ int main(void)
         cmocka_unit_test(takes_over_from_the_killed),
         cmocka_unit_test(refuses_a_queue_in_use),
         cmocka_unit_test(makes_anew_what_is_being_removed),
+        cmocka_unit_test(is_of_the_group_that_tasks_share),
         cmocka_unit_test(refuses),
         cmocka_unit_test(explains_limits),
     };
