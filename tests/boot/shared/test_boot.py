@@ -118,13 +118,15 @@ def test_ports_that_appear_disturb_no_others(robot: RobotGuest) -> None:
         robot,
         f"""
         set -e
+        warnings() {{ dmesg --level emerg,alert,crit,err,warn; }}
+        before=$(warnings | wc -l)
         exec 3<>/dev/{first}
         board=$(readlink -f /sys/class/tty/{second}/device | grep -oE '0000:[0-9a-f]+:[0-9a-f]+[.][0-7]' | tail -1)
         echo "$board" >/sys/bus/pci/drivers/serial/unbind
         [ "$(cat /sys/class/tty/{second}/type 2>/dev/null || echo 0)" = 0 ]
         echo "$board" >/sys/bus/pci/drivers/serial/bind
         cat /sys/class/tty/{second}/type
-        dmesg --level emerg,alert,crit,err,warn
+        warnings | tail -n "+$((before + 1))"
         """,
     ).splitlines()
     assert shown[0] == "4", f"{second} is no 16550A any more"
