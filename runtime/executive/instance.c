@@ -34,8 +34,7 @@ static bool may_log_in(unsigned user)
     return user == 0 || user >= FIRST_LOGIN;
 }
 
-/* Whether the lock of a process counts, by its user. The file says it, because /proc/PID itself belongs to root
- * where the process wants that. */
+/* Whether the lock of a process counts, by its user. */
 static bool counts(int process)
 {
     char line[256];

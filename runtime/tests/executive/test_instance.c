@@ -27,7 +27,7 @@ static pid_t locked_by(uid_t user, int operation)
         if (fd < 0 || (user != geteuid() && setresuid(user, user, user) != 0) || flock(fd, operation) != 0)
             _exit(1);
         prctl(PR_SET_PDEATHSIG, SIGKILL);
-        prctl(PR_SET_DUMPABLE, 0); /* its folder in /proc belongs to root then */
+        prctl(PR_SET_DUMPABLE, 0); /* most of its files in /proc belong to root then */
         (void)!write(ready[1], "", 1);
         pause();
     }
@@ -54,8 +54,7 @@ static void names_who_runs_it(void **state)
     }
 }
 
-/* As a service's user, which root alone can become. Seen to fail while each lock counted, and by the owner of the
- * folder in /proc. */
+/* As a service's user, which root alone can become. Seen to fail while each lock counted. */
 static void heeds_no_lock_of_others_as_a_service(void **state)
 {
     (void)state;

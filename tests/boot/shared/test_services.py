@@ -79,7 +79,7 @@ ON_ANOTHER = {
 
 
 def test_control_tasks_share_queues_and_nothing_else(robot: RobotGuest) -> None:
-    """Seen to fail without FLOTILLA_QUEUE_GROUP ("belongs to another user"), and with one user for all."""
+    """Seen to fail while fchown(2) was refused ("belongs to another user"), and with one user for all."""
     users = dict(zip(TASKS, privileges.task_users(len(TASKS)), strict=True))
     units = {name: f"flotilla-task@{name}.service" for name in TASKS}
     for number, (name, block) in enumerate(TASKS.items()):
