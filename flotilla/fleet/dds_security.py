@@ -2,8 +2,9 @@
 inventory says `dds_security` (DDS Security 1.1).
 
 Protected topics are the messages between control tasks that `messages.yml` lists. A robot may publish those that its
-tasks send and subscribe to those that they receive, and each sample is signed. All other topics, ROS's for one, are
-free to everybody in the domain.
+tasks send and subscribe to those that they receive, and each sample is signed. A robot sends through a DDS partition of
+its own, so a hot standby cannot claim to be its leader. All other topics, ROS's for one, are free to everybody in the
+domain.
 
 The fleet's authority signs all of that. Its key is the file `dds_authority` in `paths.KEYS`, made when first needed,
 which no robot has. Robots' keys come from the fleet's secret (message_keys.py). Each rendering gives the same bytes:
@@ -89,6 +90,7 @@ class _Authority:
         key = ec.derive_private_key(1 + derived % (_P256_ORDER - 1), ec.SECP256R1())
         identity = self._signed(robot.name, key.public_key(), _serial(shared.identity(robot)))
         topics = {"publish": _published(fleet, robot), "subscribe": _subscribed(fleet, robot)}
+        partitions = {"publish": f"robot{robot.number}", "subscribe": "*"}
         limits = {"begin": f"{_BEGIN.isoformat()}Z", "end": f"{_END.isoformat()}Z"}
         domain = fleet.network.dds_domain
         return {
@@ -98,7 +100,7 @@ class _Authority:
             "revoked": self._revoked(shared.revocations),
             "governance": self._document("dds_governance.xml.j2", domain=domain, topics=_protected(fleet)),
             "permissions": self._document("dds_permissions.xml.j2", name=robot.name, domain=domain, topics=topics,
-                                          **limits),
+                                          partitions=partitions, **limits),
         }  # fmt: skip
 
     def _signed(

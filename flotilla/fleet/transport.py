@@ -104,8 +104,9 @@ class Hop:
 
     @property
     def _topic(self) -> dict[str, object]:
-        domain = self.fleet.network.dds_domain
-        return {"type": "bytes", "bytes": self.message.bytes, "topic": self.name, "domain": domain}
+        network = self.fleet.network
+        topic = {"type": "bytes", "bytes": self.message.bytes, "topic": self.name, "domain": network.dds_domain}
+        return topic | ({"partition": "robot"} if network.dds_security else {})
 
     def _check(self, does: str, task: str) -> None:
         if self.task != task:

@@ -24,8 +24,16 @@ DOMAIN = 201 + os.getpid() % 30
 """So that tests at the same time do not hear each other."""
 GOOD, BAD = [0.25, -0.5, 0.125], [9.0, 9.0, 9.0]
 """What test_dds.py's sender publishes, and what an attacker does."""
-PARAMETERS = f"{{type: wrench, topic: wrench, robot: 2, domain: {DOMAIN}}}"
-SENT, RECEIVED = (task.format(parameters=PARAMETERS) for task in (test_dds.SENDER, test_dds.RECEIVER))
+LEADER, STANDBY = 3, 4
+"""The robot whose task `control` sends the wrench, and one that may stand by for it."""
+
+
+def parameters(robots: object) -> str:
+    return f"{{type: wrench, topic: wrench, robot: {robots}, partition: robot, domain: {DOMAIN}}}"
+
+
+SENT, SENT_BY_STANDBY = (test_dds.SENDER.format(parameters=parameters(robot)) for robot in (LEADER, STANDBY))
+RECEIVED = test_dds.RECEIVER.format(parameters=parameters([LEADER, STANDBY]))
 
 Start = Callable[..., AbstractContextManager[Task]]
 
@@ -92,8 +100,11 @@ def of_another_fleet(fleet: Fleet, own: dict[str, str], tmp_path: Path) -> str:
 
 def robot_that_allows_itself(fleet: Fleet, own: dict[str, str], tmp_path: Path) -> str:
     """Robot 2's identity is the fleet's. It signed itself that it may send what robot 3 may."""
-    tasks = {2: fleet.robots[3].control_tasks, 3: fleet.robots[2].control_tasks}
-    robots = {number: fleet.robots[number].model_copy(update={"control_tasks": tasks[number]}) for number in tasks}
+    swapped = {2: fleet.robots[3], 3: fleet.robots[2]}
+    robots = {
+        number: fleet.robots[number].model_copy(update={"number": of.number, "control_tasks": of.control_tasks})
+        for number, of in swapped.items()
+    }
     others = fleet.model_copy(update={"robots": {**fleet.robots, **robots}})
     forged = cards(others, tmp_path / "forgery")["control"]
     return exchanged(own["navigation"], forged, "PermissionsCA", "Governance", "Permissions")
@@ -140,6 +151,23 @@ def test_nobody_else_is_listened_to(
     assert {tuple(row["wrench"]) for row in rows if row["flag"]} == {tuple(GOOD)}
     said = "".join((tmp_path / f"{name}.log").read_text() for name in ("mapping", "attacker"))
     assert refusal in said
+
+
+def test_a_hot_standby_sends_as_itself_alone(fleet: Fleet, own: dict[str, str], start: Start, tmp_path: Path) -> None:
+    """It may send the topic, but not as its leader. Seen to fail with permissions for all partitions."""
+    tasks = {"control_tasks": [*fleet.robots[STANDBY].control_tasks, "control"], "standby": ["control"]}
+    robot = fleet.robots[STANDBY].model_copy(update=tasks)
+    standing_by = fleet.model_copy(update={"robots": {**fleet.robots, STANDBY: robot}})
+    security = cards(standing_by, tmp_path / "keys")["thruster-mapping"]
+    with (
+        start("mapping", RECEIVED, "in.wrench,in.flag,in.sender", own["thruster-mapping"]) as hearing,
+        start("as-leader", SENT.replace(str(GOOD), str(BAD)), "out.written", security) as attacking,
+    ):
+        attacking.until(lambda row: row["step"] >= 100)
+        with start("as-itself", SENT_BY_STANDBY, "out.written", security):
+            rows = [hearing.until(lambda row: row["flag"])]
+            rows += [row for row, _ in zip(hearing.rows(), range(200), strict=False)]
+    assert {(tuple(row["wrench"]), row["sender"]) for row in rows if row["flag"]} == {(tuple(GOOD), 1)}
 
 
 def test_nobody_else_listens(start: Start, own: dict[str, str]) -> None:

@@ -26,14 +26,18 @@
     FL_PARAMETER(block_type, lifespan, .default_value = "0.1", .min = 0.001, .max = 3600, .unit = "s",                 \
                  .summary = "older samples are not sent, nor sent again: they would look new to the subscriber")
 
+enum { DDS_PARTITIONS = 4, DDS_PARTITION_BYTES = 16 };
+
 struct dds_topic {
     const dds_topic_descriptor_t *type;
     const char *name;
     const char *user_data; /* of writer or reader; NULL: none */
     uint32_t domain;
     bool reliable;
-    double deadline; /* s; 0: none */
-    double lifespan; /* s, of samples that are written; 0 for readers */
+    double deadline;          /* s; 0: none */
+    double lifespan;          /* s, of samples that are written; 0 for readers */
+    uint32_t partition_count; /* 0: DDS's default partition */
+    char partitions[DDS_PARTITIONS][DDS_PARTITION_BYTES];
 };
 
 /* A writer or reader of a topic. */

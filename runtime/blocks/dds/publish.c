@@ -46,6 +46,7 @@ static int start(struct fl_block *block)
     const struct dds_sample first = {.robot = (uint16_t)set->robot};
     state->sender.topic = dds_topic(&set->common);
     state->sender.topic.lifespan = set->lifespan;
+    dds_enter_partition(&state->sender.topic, &set->common, (uint16_t)set->robot);
     state->sender.sample_bytes = sizeof first;
     state->sender.storage_bytes = dds_storage_bytes();
     state->sender.encode = encode;

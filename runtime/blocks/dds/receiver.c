@@ -27,6 +27,8 @@ static void arrived(dds_entity_t reader, void *context)
     while ((count = dds_take(reader, samples, infos, BATCH, BATCH)) > 0) {
         for (dds_return_t i = 0; i < count; i++) {
             *(int64_t *)receiver->arriving = now_ns;
+            receiver->reader = reader;
+            receiver->writer = infos[i].publication_handle;
             if (!infos[i].valid_data || !receiver->decode(receiver->block, samples[i], receiver->arriving))
                 continue;
             fl_ring_put(&receiver->samples, receiver->arriving);

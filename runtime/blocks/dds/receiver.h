@@ -21,8 +21,10 @@ struct dds_receiver {
     struct fl_driver *driver;
     struct fl_ring samples;
     void *arriving, *taken; /* samples: DDS's thread's, the step's */
-    int arrived_fd;         /* readable after something was put into the ring */
-    bool open, awaited;     /* awaited: await takes samples instead of the step */
+    dds_entity_t reader;    /* both of the sample that is decoded */
+    dds_instance_handle_t writer;
+    int arrived_fd;     /* readable after something was put into the ring */
+    bool open, awaited; /* awaited: await takes samples instead of the step */
     _Atomic uint32_t peers;
     struct fl_sensor sensor;
 };

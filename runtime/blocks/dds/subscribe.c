@@ -6,7 +6,8 @@
  * Failure: The flag is 0 once the newest sample is older than `timeout`, or than `deadline` where that is shorter.
  * While the flag is 0 the values stay the last good ones, and `age` grows. With several robots, one is listened to
  * once those before it have been silent for longer than `failover`. While DDS cannot be had the block tries again
- * every second, and writes to the journal.
+ * every second, and writes to the journal. With `partition: robot` a sample that comes through another robot's
+ * partition than the one it names is not taken, and is counted in `forged`.
  */
 #include "receiver.h"
 #include "topic.h"
@@ -21,9 +22,18 @@ struct dds_subscribe {
     double failover, timeout;
 };
 
+enum { WRITERS = 8 };
+
 struct state {
     struct dds_receiver receiver;
-    struct fl_failover failover; /* DDS's thread's */
+    _Atomic uint32_t forged;
+    /* DDS's thread's. */
+    struct fl_failover failover;
+    struct {
+        dds_instance_handle_t handle;
+        int robot;
+    } writers[WRITERS]; /* those that sent last */
+    unsigned next;
 };
 
 static const struct fl_parameter parameters[] = {
@@ -34,7 +44,7 @@ static const struct fl_parameter parameters[] = {
     FL_SENSOR_TIMEOUT(struct dds_subscribe, "0.1"),
 };
 
-enum { VALUES, NUMBER, STAMP, PEERS, SENDER, FLAG };
+enum { VALUES, NUMBER, STAMP, PEERS, SENDER, FLAG, AGE, SEQUENCE, FORGED };
 
 /* The rank of the robot that sent the sample, or the number of ranks if it is not listened to. */
 static size_t rank_of(const struct fl_doubles *robots, const struct dds_sample *sample)
@@ -45,6 +55,21 @@ static size_t rank_of(const struct fl_doubles *robots, const struct dds_sample *
     return rank;
 }
 
+/* The robot that the sample is from by the partition of its writer, which stays the same for as long as there is the
+ * writer. */
+static int robot_of_writer(struct state *state)
+{
+    const struct dds_receiver *receiver = &state->receiver;
+    for (int i = 0; i < WRITERS; i++)
+        if (state->writers[i].handle == receiver->writer)
+            return state->writers[i].robot;
+    int robot = dds_robot_of_partition(receiver->reader, receiver->writer);
+    state->writers[state->next].handle = receiver->writer;
+    state->writers[state->next].robot = robot;
+    state->next = (state->next + 1) % WRITERS;
+    return robot;
+}
+
 /* A topic carries the samples of all robots: keep those of the right one. */
 static bool decode(struct fl_block *block, const void *storage, void *arriving)
 {
@@ -53,6 +78,10 @@ static bool decode(struct fl_block *block, const void *storage, void *arriving)
     struct dds_sample *sample = arriving;
     if (!dds_decode(&set->common, storage, sample))
         return false;
+    if (set->common.partition == DDS_ROBOTS_PARTITION && robot_of_writer(state) != sample->robot) {
+        atomic_fetch_add(&state->forged, 1);
+        return false;
+    }
     size_t rank = rank_of(&set->robot, sample);
     sample->sender = (uint32_t)rank;
     return rank < set->robot.count && fl_failover_takes(&state->failover, rank, sample->time_ns, set->failover);
@@ -80,6 +109,11 @@ static int configure(struct fl_block *block)
          .width = 1,
          .summary = "rank of the sender that is listened to: 0 is the first of `robot`"},
         FL_SENSOR_OUTPUTS,
+        {.name = "forged",
+         .type = FL_UINT32,
+         .width = 1,
+         .flags = FL_REFUSALS,
+         .summary = "samples that name another robot than the one whose partition they came through"},
     };
     if (set->robot.count < 1 || set->robot.count > FL_SENDERS)
         return fl_fail(block, "parameter robot: give 1 to %d numbers", FL_SENDERS);
@@ -94,8 +128,11 @@ static int configure(struct fl_block *block)
 
 static int start(struct fl_block *block)
 {
+    const struct dds_subscribe *set = block->parameters;
     struct state *state = block->state;
-    state->receiver.topic = dds_topic(block->parameters);
+    state->receiver.topic = dds_topic(&set->common);
+    for (size_t i = 0; i < set->robot.count; i++)
+        dds_enter_partition(&state->receiver.topic, &set->common, (uint16_t)lround(set->robot.value[i]));
     state->receiver.sample_bytes = sizeof(struct dds_sample);
     state->receiver.decode = decode;
     state->receiver.give = give;
@@ -111,7 +148,9 @@ static int64_t await(struct fl_block *block, int64_t until_ns)
 static int step(struct fl_block *block)
 {
     const struct dds_subscribe *set = block->parameters;
-    dds_receiver_step(&((struct state *)block->state)->receiver, PEERS, FLAG, set->timeout);
+    struct state *state = block->state;
+    dds_receiver_step(&state->receiver, PEERS, FLAG, set->timeout);
+    FL_OUT(block, FORGED, uint32_t) = atomic_load(&state->forged);
     return FL_OK;
 }
 

@@ -2,6 +2,7 @@
 
 #include "flotilla.h"
 
+#include <stdio.h>
 #include <string.h>
 
 union dds_storage {
@@ -51,6 +52,36 @@ struct dds_topic dds_topic(const struct dds_settings *settings)
         .reliable = settings->reliability,
         .deadline = settings->deadline,
     };
+}
+
+static void name_partition(char name[DDS_PARTITION_BYTES], uint16_t robot)
+{
+    snprintf(name, DDS_PARTITION_BYTES, "robot%u", (unsigned)robot);
+}
+
+void dds_enter_partition(struct dds_topic *topic, const struct dds_settings *settings, uint16_t robot)
+{
+    if (settings->partition == DDS_ROBOTS_PARTITION)
+        name_partition(topic->partitions[topic->partition_count++], robot);
+}
+
+int dds_robot_of_partition(dds_entity_t reader, dds_instance_handle_t writer)
+{
+    uint32_t count = 0;
+    char **names = NULL, expected[DDS_PARTITION_BYTES];
+    unsigned short robot = 0;
+    dds_builtintopic_endpoint_t *publication = dds_get_matched_publication_data(reader, writer);
+    if (!publication)
+        return -1;
+    bool own =
+        dds_qget_partition(publication->qos, &count, &names) && count == 1 && sscanf(names[0], "robot%hu", &robot) == 1;
+    name_partition(expected, robot);
+    own = own && strcmp(names[0], expected) == 0;
+    for (uint32_t i = 0; i < count; i++)
+        dds_free(names[i]);
+    dds_free(names);
+    dds_builtintopic_free_endpoint(publication);
+    return own ? robot : -1;
 }
 
 struct fl_port dds_port(const struct dds_settings *settings)

@@ -21,7 +21,10 @@ struct dds_settings {
     int64_t domain, bytes;
     int reliability;
     double deadline;
+    int partition;
 };
+
+enum dds_partition { DDS_DEFAULT_PARTITION, DDS_ROBOTS_PARTITION };
 
 #define DDS_PARAMETERS                                                                                                 \
     FL_PARAMETER(struct dds_settings, type, .choices = "state|wrench|valves|bytes",                                    \
@@ -29,10 +32,19 @@ struct dds_settings {
         FL_PARAMETER(struct dds_settings, topic, .summary = "name of the topic"),                                      \
         FL_PARAMETER(struct dds_settings, bytes, .default_value = "64", .min = 1, .max = DDS_VALUES, .unit = "B",      \
                      .summary = "length of a sample of type `bytes`"),                                                 \
+        FL_PARAMETER(struct dds_settings, partition, .default_value = "default", .choices = "default|robot",           \
+                     .summary = "robot: samples go through the DDS partition `robotN`, with the number of the robot "  \
+                                "that sends, into which permissions of DDS Security can let that robot alone"),        \
         DDS_QUALITIES(struct dds_settings, "best-effort")
 
 /* The topic that the parameters describe, but for a lifespan. */
 struct dds_topic dds_topic(const struct dds_settings *settings);
+
+/* Send, or listen, through that robot's partition, too, where the parameters say so. At most DDS_PARTITIONS times. */
+void dds_enter_partition(struct dds_topic *topic, const struct dds_settings *settings, uint16_t robot);
+
+/* The robot whose partition the writer is in, which sends to that reader; -1: none, more than one, or it has gone. */
+int dds_robot_of_partition(dds_entity_t reader, dds_instance_handle_t writer);
 
 /* The port that carries the type's values. */
 struct fl_port dds_port(const struct dds_settings *settings);

@@ -1,5 +1,6 @@
 /* Publishers and subscribers in one process and in two, on loopback only: no multicast, no other interface. */
 #define _GNU_SOURCE
+#include "flotilla.h"
 #include "seccomp.h"
 #include "testbed.h"
 
@@ -233,6 +234,57 @@ static void another_stands_by(void **state)
                            "robot: 1.5 is not a whole number"));
     assert_non_null(strstr(testbed_refusal("dds-subscribe", "type", "wrench", "topic", "s", "robot", "1,2,3,4,5", NULL),
                            "robot: give 1 to 4 numbers"));
+}
+
+/* A writer of another program's in these partitions. */
+static dds_entity_t stranger(dds_entity_t participant, const char *topic, uint32_t count, const char **partitions)
+{
+    dds_qos_t *qualities = dds_create_qos();
+    dds_qset_reliability(qualities, DDS_RELIABILITY_BEST_EFFORT, 0);
+    dds_qset_partition(qualities, count, partitions);
+    dds_entity_t described = dds_create_topic(participant, &flotilla_Wrench_desc, topic, NULL, NULL);
+    dds_entity_t writer = dds_create_writer(participant, described, qualities, NULL);
+    assert_true(writer > 0);
+    dds_delete_qos(qualities);
+    return writer;
+}
+
+/* Permissions let a hot standby, robot 2, send through its own partition, so what it says is from there. Seen to fail
+ * without the comparison, and with a pattern or two partitions that were taken for robot 1's. */
+static void who_says_another_robots_number_is_not_believed(void **state)
+{
+    (void)state;
+    const char *own[] = {"robot2"}, *both[] = {"robot1", "robot2"}, *pattern[] = {"robot1*"};
+    const flotilla_Wrench claimed = {.header = {.robot = 1}, .torque = 9};
+    struct fl_block *leader = publisher((struct node){"wrench", "p", "1", "partition", "robot"});
+    struct fl_block *standby = publisher((struct node){"wrench", "p", "2", "partition", "robot"});
+    struct fl_block *open = publisher((struct node){"wrench", "p", "1", NULL, NULL});
+    struct fl_block *to = testbed_block("dds-subscribe", "timeout", "30", "type", "wrench", "topic", "p", "robot",
+                                        "1,2", "domain", domain, "partition", "robot", "failover", "1", NULL);
+    testbed_begin(to);
+    assert_true(reaches(to, "sender", 1, standby)); /* the leader has said nothing yet */
+    assert_int_equal(GET(to, "forged", uint32_t), 0);
+    dds_entity_t participant = dds_create_participant((dds_domainid_t)atoi(domain), NULL, NULL);
+    dds_entity_t forging[] = {stranger(participant, "p", 1, own), stranger(participant, "p", 2, both),
+                              stranger(participant, "p", 1, pattern)};
+    const uint32_t forgers = sizeof forging / sizeof forging[0];
+    assert_true(reaches(to, "peers", 2 + forgers, NULL));
+    for (uint32_t i = 0; i < forgers; i++) {
+        uint32_t before = GET(to, "forged", uint32_t);
+        for (uint32_t n = 0; n < 5; n++) {
+            assert_int_equal(dds_write(forging[i], &claimed), DDS_RETCODE_OK);
+            step(open);
+        }
+        assert_true(reaches(to, "forged", before + 5, standby));
+        assert_int_equal(GET(to, "sender", uint32_t), 1);
+        assert_near(((const double *)testbed_output(to, "wrench"))[2], 0, 0);
+    }
+    assert_true(reaches(to, "sender", 0, leader));
+    dds_delete(participant);
+    testbed_end(leader);
+    testbed_end(standby);
+    testbed_end(open);
+    testbed_end(to);
 }
 
 static void takes_no_other_length(void **state)
@@ -489,6 +541,7 @@ int main(void)
         cmocka_unit_test(leaves_no_garbage),
         cmocka_unit_test(publishes_what_is_new_alone),
         cmocka_unit_test(another_stands_by),
+        cmocka_unit_test(who_says_another_robots_number_is_not_believed),
         cmocka_unit_test(takes_no_other_length),
         cmocka_unit_test(qualities_are_asked_for),
         cmocka_unit_test(a_missed_deadline_is_no_good),
