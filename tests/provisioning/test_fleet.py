@@ -322,7 +322,7 @@ def test_a_task_is_stopped_and_started(guests: Guests) -> None:
 
 @pytest.mark.nightly
 def test_what_robots_say_and_record_is_collected(guests: Guests) -> None:
-    guests.sudo("robot1", "echo 1,2,3 >/var/lib/flotilla/heading/some.csv; chown -R control /var/lib/flotilla/heading")
+    guests.sudo("robot1", "cd /var/lib/flotilla/heading; echo 1,2,3 >some.csv; chown --reference=. some.csv")
     done = guests.play("-l", "robot1", playbook="collect")
     assert done.status == 0, done.said
     place = paths.BUILD / "collected" / "robot1"
