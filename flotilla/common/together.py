@@ -49,8 +49,8 @@ def run(*works: Callable[[], object]) -> None:
     token = _group.set(group)
     try:
         with ThreadPoolExecutor(len(works)) as threads:
-            coming = [threads.submit(copy_context().run, work) for work in works]
             try:
+                coming = [threads.submit(copy_context().run, work) for work in works]
                 for future in as_completed(coming):
                     future.result()
             except BaseException:

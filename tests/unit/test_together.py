@@ -6,8 +6,10 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -92,6 +94,23 @@ def test_an_interruption_ends_all(endless: Endless) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         together.run(endless.run, interrupt)
+    assert gone(seen[0])
+
+
+def test_an_interruption_ends_what_has_begun(endless: Endless, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While not all of the work has begun. Seen to wait for what had, for as long as that took."""
+    submit, seen = ThreadPoolExecutor.submit, []
+
+    def interrupted(*arguments: Any) -> Any:
+        if seen:
+            raise KeyboardInterrupt
+        begun = submit(*arguments)
+        seen.append(endless.number())
+        return begun
+
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        together.run(endless.run, lambda: None)
     assert gone(seen[0])
 
 
