@@ -363,11 +363,13 @@ def test_parameters_are_the_users_of_the_task_alone(loop: Loop) -> None:
 
 def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:
     """By itself: `success`. A slow host may take longer to stop it than a robot, or end it by late steps just then."""
-    patient = f"/run/systemd/system/{UNIT}.d/patient.conf"
-    results = []
+    drop_in = f"/run/systemd/system/{UNIT}.d"
+    results: list[str] = []
     as_root = ["sudo", "sh", "-e"]
-    write = f"mkdir {Path(patient).parent}; printf '[Service]\\nTimeoutStopSec=60\\n' >{patient}; systemctl daemon-reload"
-    loop.robot.shell.run(as_root, stdin=write)
+    patient = (
+        f"mkdir {drop_in}; printf '[Service]\\nTimeoutStopSec=60\\n' >{drop_in}/patient.conf; systemctl daemon-reload"
+    )
+    loop.robot.shell.run(as_root, stdin=patient)
     while "success" not in results and len(results) < 5:
         loop.main_pid()
         loop.plant.kick(math.radians(15))
@@ -376,7 +378,7 @@ def test_a_stopped_task_leaves_its_outputs_reset(loop: Loop) -> None:
         assert loop.board.wait_relays(on=False)
         results.append(loop.unit("Result"))
         loop.robot.shell.run(["sudo", "systemctl", "start", UNIT])
-    loop.robot.shell.run(as_root, stdin=f"rm -r {Path(patient).parent}; systemctl daemon-reload")
+    loop.robot.shell.run(as_root, stdin=f"rm -r {drop_in}; systemctl daemon-reload")
     assert results[-1] == "success", results
 
 

@@ -3,6 +3,7 @@
 #include "flotilla.h"
 
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 
 union dds_storage {
@@ -67,21 +68,25 @@ void dds_enter_partition(struct dds_topic *topic, const struct dds_settings *set
 
 int dds_robot_of_partition(dds_entity_t reader, dds_instance_handle_t writer)
 {
+    static const char prefix[] = "robot";
     uint32_t count = 0;
     char **names = NULL, expected[DDS_PARTITION_BYTES];
-    unsigned short robot = 0;
+    int robot = -1;
     dds_builtintopic_endpoint_t *publication = dds_get_matched_publication_data(reader, writer);
     if (!publication)
         return -1;
-    bool own =
-        dds_qget_partition(publication->qos, &count, &names) && count == 1 && sscanf(names[0], "robot%hu", &robot) == 1;
-    name_partition(expected, robot);
-    own = own && strcmp(names[0], expected) == 0;
+    if (dds_qget_partition(publication->qos, &count, &names) && count == 1 &&
+        strncmp(names[0], prefix, strlen(prefix)) == 0) {
+        robot = (uint16_t)strtoul(names[0] + strlen(prefix), NULL, 10);
+        name_partition(expected, (uint16_t)robot);
+        if (strcmp(names[0], expected) != 0)
+            robot = -1;
+    }
     for (uint32_t i = 0; i < count; i++)
         dds_free(names[i]);
     dds_free(names);
     dds_builtintopic_free_endpoint(publication);
-    return own ? robot : -1;
+    return robot;
 }
 
 struct fl_port dds_port(const struct dds_settings *settings)
