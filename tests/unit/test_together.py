@@ -99,7 +99,8 @@ def test_an_interruption_ends_all(endless: Endless) -> None:
 
 def test_an_interruption_ends_what_has_begun(endless: Endless, monkeypatch: pytest.MonkeyPatch) -> None:
     """While not all of the work has begun. Seen to wait for what had, for as long as that took."""
-    submit, seen = ThreadPoolExecutor.submit, []
+    submit = ThreadPoolExecutor.submit
+    seen: list[int] = []
 
     def interrupted(*arguments: Any) -> Any:
         if seen:
