@@ -31,8 +31,7 @@ FLOWN = ("air", "air-1", "air-5", "air-10")
 SECURED = "air-dds-secured"
 CUT = "air-cut-open"
 CHECKED_S, REJOINED_S = 5, 2
-"""The pause between two looks of `flotilla-cell@` at the adapter; what a look, joining and the first command take, for
-which a dozen programs are started, each of which may cost this processor a tenth of a second."""
+"""The pause between two looks of `flotilla-cell@`, and what a look, joining and the first command take."""
 LOST = {"air": 0.0}
 """By flight, the share of steps that may be lost; of the others, as in flights of one guest."""
 

@@ -61,7 +61,7 @@ static dds_qos_t *qualities_of(const struct dds_topic *topic)
     if (topic->user_data)
         dds_qset_userdata(qualities, topic->user_data, strlen(topic->user_data));
     if (topic->partition_count) {
-        const char *names[DDS_PARTITIONS];
+        const char *names[FL_SENDERS];
         for (uint32_t i = 0; i < topic->partition_count; i++)
             names[i] = topic->partitions[i];
         dds_qset_partition(qualities, topic->partition_count, names);

@@ -10,6 +10,7 @@
 
 #include <dds/dds.h>
 #include <flotilla/driver.h>
+#include <flotilla/failover.h>
 
 /* Parameters that all blocks have: members `domain`, `reliability` and `deadline` of the structure. */
 #define DDS_QUALITIES(settings_type, usual_reliability)                                                                \
@@ -26,7 +27,7 @@
     FL_PARAMETER(block_type, lifespan, .default_value = "0.1", .min = 0.001, .max = 3600, .unit = "s",                 \
                  .summary = "older samples are not sent, nor sent again: they would look new to the subscriber")
 
-enum { DDS_PARTITIONS = 4, DDS_PARTITION_BYTES = 16 };
+enum { DDS_PARTITION_BYTES = 16 };
 
 struct dds_topic {
     const dds_topic_descriptor_t *type;
@@ -37,7 +38,7 @@ struct dds_topic {
     double deadline;          /* s; 0: none */
     double lifespan;          /* s, of samples that are written; 0 for readers */
     uint32_t partition_count; /* 0: DDS's default partition */
-    char partitions[DDS_PARTITIONS][DDS_PARTITION_BYTES];
+    char partitions[FL_SENDERS][DDS_PARTITION_BYTES];
 };
 
 /* A writer or reader of a topic. */

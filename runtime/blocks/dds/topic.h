@@ -40,7 +40,7 @@ enum dds_partition { DDS_DEFAULT_PARTITION, DDS_ROBOTS_PARTITION };
 /* The topic that the parameters describe, but for a lifespan. */
 struct dds_topic dds_topic(const struct dds_settings *settings);
 
-/* Send, or listen, through that robot's partition, too, where the parameters say so. At most DDS_PARTITIONS times. */
+/* Send, or listen, through that robot's partition, too, where the parameters say so. At most FL_SENDERS times. */
 void dds_enter_partition(struct dds_topic *topic, const struct dds_settings *settings, uint16_t robot);
 
 /* The robot whose partition the writer is in, which sends to that reader; -1: none, more than one, or it has gone. */
