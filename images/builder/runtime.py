@@ -23,11 +23,6 @@ _RENAMED = {"trixie": {"libddsc0debian": "libddsc0t64", "libnettle8": "libnettle
 """Debian's newer names, by release."""
 WARNINGS = ("-Wall", "-Wextra", "-Werror")
 """Compiler options for code that is written by hand."""
-_LOADERS = {
-    "amd64": ("lib64/ld-linux-x86-64.so.2", "usr/lib/x86_64-linux-gnu"),
-    "i386": ("lib/ld-linux.so.2", "usr/lib/i386-linux-gnu"),
-}
-"""The dynamic loader and the libraries in a tree of an architecture. A 64-bit PC runs programs for both."""
 _KIND = "runtime"
 """Of results in the cache."""
 _LEFT_OUT = ("bench", "tests", "tidy.py")
@@ -134,10 +129,8 @@ def _programs(system: System) -> Path:
 def _run(system: System, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a program of the runtime on this computer, whatever libraries that has."""
     tree = tools.tree(read_lock(runtime_lock(system)))
-    loader, directory = _LOADERS[system.architecture]
-    argv = [str(tree / loader), "--library-path", str(tree / directory)]
-    argv += [str(_programs(system) / "usr/bin" / program), *arguments]
-    return subprocess.run(argv, capture_output=True, encoding="utf-8", check=False)
+    argv = tools.command(tree, _programs(system) / "usr/bin" / program, system.architecture)
+    return subprocess.run([*argv, *arguments], capture_output=True, encoding="utf-8", check=False)
 
 
 def sources() -> list[Path]:

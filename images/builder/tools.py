@@ -17,6 +17,12 @@ from images.builder import pool
 from images.builder.lock import Lock, Package
 
 _MERGED = ("bin", "sbin", "lib", "lib32", "lib64")
+_LOADERS = {
+    "amd64": "usr/lib/x86_64-linux-gnu/ld-linux-x86-64.so.2",
+    "i386": "usr/lib/i386-linux-gnu/ld-linux.so.2",
+}
+"""The dynamic loader beside its C library, by architecture; a 64-bit PC runs programs of both. The names in which
+programs ask for it are links that begin at the root: outside a chroot they lead to this computer's loader."""
 _MOUNT_POINTS = ("dev", "proc", "sys", "tmp", "repository", "target", "out", "run")
 
 
@@ -50,10 +56,11 @@ def _unpack(package: Package, directory: Path) -> None:
         raise UserError(f"cannot unpack {package.name} {package.version} ({pool.file(package)})")
 
 
-def command(tree: Path, program: str) -> list[str]:
-    """What runs a program of a tree (`usr/sbin/mke2fs`) by the tree's own dynamic loader and libraries."""
-    loader, libraries = tree / "lib64/ld-linux-x86-64.so.2", tree / "usr/lib/x86_64-linux-gnu"
-    return [str(loader), "--library-path", str(libraries), str(tree / program)]
+def command(tree: Path, program: str | Path, architecture: str = "amd64") -> list[str]:
+    """The command that runs a program of a tree (`usr/sbin/mke2fs`), or one elsewhere by its absolute path, by the
+    tree's own dynamic loader and libraries."""
+    loader = tree / _LOADERS[architecture]
+    return [str(loader), "--library-path", str(loader.parent), str(tree / program)]
 
 
 class Tools:

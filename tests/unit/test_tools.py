@@ -50,3 +50,28 @@ def test_a_program_is_compiled_for_the_boards_processor(
     board = inventory.load_fleet().boards["smartcoret3"].model_copy(update={"processor": processor})
     assert toolchain.compile_static(tmp_path / "program.c", board) == b"program"
     assert [word for word in compiled if word.startswith("-march=")][-1] == f"-march={compiled_for}"
+
+
+@pytest.mark.parametrize(
+    ("architecture", "triplet", "asked_for"),
+    [
+        ("amd64", "x86_64-linux-gnu", "lib64/ld-linux-x86-64.so.2"),
+        ("i386", "i386-linux-gnu", "lib/ld-linux.so.2"),
+    ],
+)
+def test_a_tool_is_run_by_the_loader_of_its_own_tree(
+    tmp_path: Path, architecture: str, triplet: str, asked_for: str
+) -> None:
+    """Seen to fail: the link that Debian's package has at the loader's well-known place led out of the tree, so the
+    host's loader ran with the tree's C library, which of another glibc ends by `stack smashing detected`."""
+    link = tmp_path / "usr" / asked_for
+    real = tmp_path / f"usr/lib/{triplet}" / link.name
+    for directory in (link.parent, real.parent):
+        directory.mkdir(parents=True, exist_ok=True)
+    real.touch()
+    link.symlink_to(f"/lib/{triplet}/{link.name}")
+    (tmp_path / Path(asked_for).parent).symlink_to(f"usr/{Path(asked_for).parent}")
+    loader, option, libraries, program = tools.command(tmp_path, "usr/sbin/mke2fs", architecture)
+    assert Path(loader).resolve() == real
+    assert (option, Path(libraries).resolve()) == ("--library-path", real.parent)
+    assert program == str(tmp_path / "usr/sbin/mke2fs")
