@@ -342,7 +342,7 @@ setup: $(VENV)/.installed ## install what building needs
 # Ansible's plugins and the command `flotilla` find the packages of this checkout.
 $(VENV)/.installed: $(VENV)/.complete pyproject.toml
 	$(Q)$(VENV)/bin/pip install --quiet --no-index --no-deps --no-build-isolation --editable .
-	$(Q)touch $@
+	$(Q)sync -f $(VENV) && touch $@
 
 setup-tests: setup ## install what testing needs
 	$(Q)images/install-host-packages tests/host-packages.txt
@@ -359,7 +359,7 @@ $(VENV)/.complete: requirements.lock requirements-source.lock images/host-packag
 	$(Q)set -e; test ! -e $@ || { rm -rf $(VENV).before; mv $(VENV) $(VENV).before; }; \
 	    trap 'test -e $@ || test ! -e $(VENV).before || { rm -rf $(VENV); mv $(VENV).before $(VENV); }' EXIT; \
 	    trap 'exit 1' HUP INT TERM; \
-	    rm -rf $(VENV); $(new_venv); touch $@; rm -rf $(VENV).before
+	    rm -rf $(VENV); $(new_venv); sync -f $(VENV); touch $@; rm -rf $(VENV).before
 
 clean: ## remove all outputs; keys stay
 	$(Q)rm -rf $(BUILD)

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import yaml
 
 from flotilla.apps import app, ert
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import System
 
@@ -70,7 +70,7 @@ def create(
             description["sample_times"] = list(sample_times_s)  # type: ignore[assignment]
         (work / app.FILE).write_text(yaml.safe_dump(description, sort_keys=False))
         (work / app.TASK).write_text(_task(work, name, model, sample_times_s, systems))
-        work.rename(directory)
+        durable.rename(work, directory)
     inputs = f"wire the model's inputs in {paths.shown(directory / app.TASK)}, which are zero"
     return f"{paths.shown(directory)} is ready; {inputs}, and bring it to a robot: {_deploy(directory)}"
 
@@ -84,7 +84,7 @@ def _replace(new: Path, place: Path) -> None:
     old = new.with_name("old")
     if place.exists():
         place.rename(old)
-    new.rename(place)
+    durable.rename(new, place)
 
 
 def _unpack(archive: Path, out: Path) -> None:

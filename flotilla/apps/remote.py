@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from flotilla.apps import app, fmu
-from flotilla.common import paths, progress
+from flotilla.common import durable, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.common.processes import DIE_WITH_PARENT
 from flotilla.fleet import apps
@@ -321,9 +321,7 @@ def _file(to: Connection, name: str, kind: str) -> Path:
 def _write(to: Connection, name: str, kind: str, text: str) -> None:
     file = _file(to, name, kind)
     file.parent.mkdir(parents=True, exist_ok=True)
-    beside = file.with_name(f".{file.name}.new")
-    beside.write_text(text)
-    beside.rename(file)
+    durable.write(file, text)
 
 
 def need_kib(size: int) -> int:

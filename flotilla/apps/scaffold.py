@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from flotilla.apps import app
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 
 EXAMPLES = paths.PROJECT / "examples"
@@ -32,7 +32,7 @@ def create(kind: str, name: str, parent: Path | None = None) -> str:
             continue
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_text(_renamed(file.read_text(encoding="utf-8"), example.name, name), encoding="utf-8")
-    beside.rename(final)
+    durable.rename(beside, final)
     return f"{paths.shown(final)} is ready; bring it to a robot: make deploy ROBOT=… APP={paths.shown(final)}"
 
 

@@ -1,7 +1,8 @@
 """Results of build steps, kept under the hash of everything that went into them.
 
-A result is a directory. It is made beside its place and renamed when complete, so that an interrupted build leaves
-nothing that could be taken for a result; what it left is removed by the next build.
+A result is a directory. It is made beside its place and renamed when it is complete and on its device, so that neither
+an interrupted build nor a power cut leaves anything that could be taken for a result; the next build removes the rest.
+It has a list of its files with their sizes. A result that differs from its list, or has none, is made anew.
 
 A build that succeeds removes old results: the newest of each kind stay, those that it used itself, and those that
 another process may be using.
@@ -11,9 +12,11 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import json
 import os
 import re
 import shutil
+import stat
 import threading
 import time
 from collections import defaultdict
@@ -21,14 +24,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flotilla.common import host, paths, progress
+from flotilla.common import durable, host, paths, progress
 
 _KEPT = 4
 """The newest results of a kind, which stay whoever used them: with two boards, the present one and the one before."""
 _IN_USE_S = 3600
 """After its last use by any process."""
 _RESULT = re.compile(r"(.+)-[0-9a-f]{16}(\.part)?")
+_LIST = ".complete"
+"""What a result has, JSON: sizes by path. It is written last."""
 _used: set[Path] = set()
+_whole: set[Path] = set()
+"""Results that this process has compared with their lists."""
 _making: dict[Path, threading.Lock] = {}
 
 
@@ -56,10 +63,10 @@ def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
     """The directory that `make` fills, made once per `kind` and `key`."""
     final = paths.CACHE / name(kind, key)
     _used.add(final)
-    if not final.exists():
+    if not _is_whole(final):
         # A thread of our own that makes it is no other command to tell of.
         with _making.setdefault(final, threading.Lock()), locked(paths.CACHE / f".{final.name}.lock"):
-            if not final.exists():  # nobody else made it meanwhile
+            if not _is_whole(final):  # nobody else made it meanwhile
                 _make(final, make)
     os.utime(final)  # it was of use just now: see `clean`
     return final
@@ -67,7 +74,7 @@ def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:
 
 def has(kind: str, key: str) -> bool:
     """Whether `result` would have nothing to make."""
-    return (paths.CACHE / name(kind, key)).exists()
+    return _is_whole(paths.CACHE / name(kind, key))
 
 
 def name(kind: str, key: str) -> str:
@@ -78,15 +85,48 @@ def name(kind: str, key: str) -> str:
 def _make(final: Path, make: Callable[[Path], None]) -> None:
     beside = final.with_name(final.name + ".part")
     discard(beside)
+    if final.exists():
+        progress.say(f"{paths.shown(final)}: is not whole, so it is made anew")
+        final.rename(beside)
+        discard(beside)
     beside.mkdir(parents=True)
     try:
         with host.explaining_a_full_disk():
             make(beside)
-        beside.rename(final)
+            (beside / _LIST).write_text(json.dumps(_sizes(beside)))
+            durable.rename(beside, final)
+        _whole.add(final)
     finally:
         if beside.exists():  # a kernel's objects take seconds
             with progress.step(f"remove {paths.shown(beside)}, which is not complete"):
                 discard(beside)
+
+
+def _is_whole(final: Path) -> bool:
+    """Whether the result is there as it was made. Files that its users have added since do not matter."""
+    if not final.exists():
+        return False
+    if final not in _whole:
+        try:
+            listed: dict[str, int] = json.loads((final / _LIST).read_text())
+            if any(_size(f"{final}/{path}") != size for path, size in listed.items()):
+                return False
+        except (OSError, ValueError):  # a file that is not there, or no list
+            return False
+        _whole.add(final)
+    return True
+
+
+def _sizes(directory: Path) -> dict[str, int]:
+    """Of all files and links below a directory."""
+    files = [f"{parent}/{name}" for parent, names, others in os.walk(directory) for name in names + others]
+    return {os.path.relpath(file, directory): size for file in files if (size := _size(file)) >= 0}
+
+
+def _size(path: str) -> int:
+    """In bytes; -1 of a directory, whose size is the file system's own."""
+    status = os.lstat(path)
+    return -1 if stat.S_ISDIR(status.st_mode) else status.st_size
 
 
 def discard(directory: Path) -> None:

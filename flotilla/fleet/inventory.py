@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from flotilla.common import cache, paths
+from flotilla.common import cache, durable, paths
 from flotilla.common.errors import Problem, ProblemsError, UserError
 from flotilla.common.yaml_file import SYNTAX, Entry, Loc, child, compose, did_you_mean, dotted, explained, pairs
 from flotilla.fleet import apps, messages, privileges
@@ -108,13 +108,13 @@ def _merged(directory: Path) -> dict[str, Any]:
     files = [file for file in sorted(directory.rglob("*")) if file.is_file()]
     contents = [part for file in files for part in (str(file.relative_to(directory)), file.read_bytes())]
     kept = paths.CACHE / f"inventory-{cache.digest(version('ansible-core'), *contents)}.json"
-    if not kept.exists():
+    try:
+        merged: dict[str, Any] = json.loads(kept.read_text())
+    except (FileNotFoundError, ValueError):  # or cut short by a power cut
         text = _ansible_inventory(directory)
         kept.parent.mkdir(parents=True, exist_ok=True)
-        beside = kept.with_suffix(f".{os.getpid()}")
-        beside.write_text(text)
-        beside.rename(kept)
-    merged: dict[str, Any] = json.loads(kept.read_text())
+        durable.write(kept, text)
+        merged = json.loads(text)
     return merged
 
 

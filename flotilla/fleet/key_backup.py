@@ -13,7 +13,7 @@ import sys
 import tarfile
 from pathlib import Path
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 
 
@@ -30,7 +30,7 @@ def backup(to: Path, password: Path | None) -> int:
     try:
         _vault("encrypt", password, content.getvalue(), beside)
         beside.chmod(0o600)
-        beside.replace(to)
+        durable.rename(beside, to)
     finally:
         beside.unlink(missing_ok=True)
     return len(files)
@@ -58,7 +58,7 @@ def restore(source: Path, password: Path | None) -> int:
         paths.KEYS.mkdir(mode=0o700, parents=True, exist_ok=True)
         for file in restored:
             file.chmod(0o600)
-            file.replace(paths.KEYS / file.name)
+            durable.rename(file, paths.KEYS / file.name)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return len(restored)

@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet, Robot
 
@@ -49,8 +49,8 @@ def _generate(path: Path, comment: str) -> None:
         subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     except subprocess.CalledProcessError as error:
         raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
-    _public_file(beside).rename(_public_file(path))
-    beside.rename(path)
+    durable.rename(_public_file(beside), _public_file(path))
+    durable.rename(beside, path)
 
 
 @contextmanager
@@ -92,7 +92,7 @@ def host_keys(fleet: Fleet) -> dict[str, str]:
     pinned += "".join(f"@revoked * {key}\n" for key in revoked())
     known = paths.KEYS / "known_hosts"
     if not known.exists() or known.read_text() != pinned:
-        write(known, pinned)
+        durable.write(known, pinned)
     return keys
 
 
@@ -109,7 +109,7 @@ def revocations() -> Counter[str]:
 
 def rotate_host_key(fleet: Fleet, robot: Robot) -> None:
     """Give a robot a new host key. The old one is accepted on this computer until `retire_host_key`."""
-    write(_retired(robot), host_keys(fleet)[robot.name] + "\n")
+    durable.write(_retired(robot), host_keys(fleet)[robot.name] + "\n")
     _remove(of_robot(robot))
     host_keys(fleet)
 
@@ -126,7 +126,7 @@ def revoke_host_key(fleet: Fleet, robot: Robot) -> None:
     if _retired(robot).exists():
         lost.append(_retired(robot).read_text().strip())
     before = _revoked().read_text() if _revoked().exists() else ""
-    write(_revoked(), before + "".join(f"{key} {robot.name}\n" for key in lost))
+    durable.write(_revoked(), before + "".join(f"{key} {robot.name}\n" for key in lost))
     _retired(robot).unlink(missing_ok=True)
     _remove(of_robot(robot))
     host_keys(fleet)
@@ -167,8 +167,8 @@ def rotate_operator_key() -> None:
             f"{paths.shown(former)}: an earlier rotation has not ended; `make provision`, then "
             "`make rotate-key KEY=operator RETIRE=1`"
         )
-    now.rename(former)  # from here on whoever asks first makes a new one
-    _public_file(now).rename(_public_file(former))
+    durable.write(_public_file(former), _public_file(now).read_text())
+    durable.rename(now, former)  # from here on whoever asks first makes a new one
     operator()
 
 
@@ -197,16 +197,12 @@ def write_once(file: Path, text: str) -> None:
     beside.unlink(missing_ok=True)
     with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:
         stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
     try:
         os.link(beside, file)
+        durable.sync_names(file.parent)
     except FileExistsError:
         pass  # another process was first
     finally:
         beside.unlink()
-
-
-def write(file: Path, text: str) -> None:
-    """Whole or not at all, whatever was there."""
-    beside = file.with_name(f".{file.name}.{os.getpid()}")
-    beside.write_text(text)
-    beside.rename(file)

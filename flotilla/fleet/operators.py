@@ -24,7 +24,7 @@ from datetime import UTC, datetime, timedelta
 from ipaddress import IPv4Network
 from pathlib import Path
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import keys
 from flotilla.fleet.model import Fleet
@@ -87,8 +87,8 @@ def admit(
         admission = Admission(name, serial, key, now + timedelta(days=days), networks)
         certificate = _certificate(key_file, admission)
         _record([*before, admission])
-    keys.write(folder / "known_hosts", (paths.KEYS / "known_hosts").read_text())
-    keys.write(folder / CERTIFICATE, certificate)
+    durable.write(folder / "known_hosts", (paths.KEYS / "known_hosts").read_text())
+    durable.write(folder / CERTIFICATE, certificate)
     return folder, admission
 
 
@@ -102,7 +102,7 @@ def revoke(name: str) -> None:
             raise UserError(f"NAME={name}: no operator of that name was admitted; {remedy}")
         before = _revoked().read_text() if _revoked().exists() else ""
         new = [key for key in dict.fromkeys(theirs) if key not in revoked()]
-        keys.write(_revoked(), before + "".join(f"{key} {name}\n" for key in new))
+        durable.write(_revoked(), before + "".join(f"{key} {name}\n" for key in new))
 
 
 def revoked() -> list[str]:
@@ -232,7 +232,7 @@ def _admissions() -> list[Admission]:
 
 def _record(admissions: list[Admission]) -> None:
     described = [vars(each) | {"until": each.until.strftime(_TIME)} for each in admissions]
-    keys.write(_admitted(), json.dumps(described, indent=1) + "\n")
+    durable.write(_admitted(), json.dumps(described, indent=1) + "\n")
 
 
 def _admitted() -> Path:

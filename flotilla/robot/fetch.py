@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from flotilla.common import paths, progress
+from flotilla.common import durable, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
@@ -98,7 +98,7 @@ def _have(each: _Remote, place: Path) -> int:
     if part.exists() and not _begins(part, each):
         part.unlink()
     if part.exists() and part.stat().st_size >= each.size:
-        part.replace(file)
+        durable.rename(part, file)
     return max((path.stat().st_size for path in (file, part) if path.exists()), default=0)
 
 
@@ -121,7 +121,7 @@ def _bring(robot: Robot, task: str, each: _Remote, begin: int, file: Path, came:
                 return False
         if part.stat().st_size < each.size:
             raise UserError(f"{robot.name}: {each.name}: ended too early; fetch again, it goes on from there")
-        part.replace(file)
+        durable.rename(part, file)
     except OSError as error:
         raise UserError(f"{paths.shown(file)}: {error.strerror}; make room, or name another place: OUT=") from error
     return True

@@ -6,7 +6,7 @@ import re
 import shlex
 import subprocess
 
-from flotilla.common import paths, progress
+from flotilla.common import durable, paths, progress
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 
@@ -83,7 +83,5 @@ def check(robot: Robot, seconds: int) -> str:
     sections = [
         f"== {name}{f' (status {status})' if status else ''}\n{output}" for name, (status, output) in found.items()
     ]
-    beside = file.with_suffix(".new")
-    beside.write_text("\n".join([f"== summary\n{text}\n", *sections]))
-    beside.rename(file)
+    durable.write(file, "\n".join([f"== summary\n{text}\n", *sections]))
     return f"{text}\n{paths.shown(file)}: send it with your report"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
@@ -64,7 +64,7 @@ def _keep(beside: Path, file: Path) -> int:
     rows = max(whole.count(b"\n") - 1, 0)
     if rows:
         beside.write_bytes(whole)
-        beside.replace(file)
+        durable.rename(beside, file)
     return rows
 
 

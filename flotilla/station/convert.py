@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from flotilla.common import paths, progress
+from flotilla.common import durable, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.station import recording, segments
 from flotilla.station.recording import Array
@@ -61,7 +61,7 @@ def convert(given: Sequence[Path], out: Path) -> list[str]:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             said = form(recorded, beside, read)
-            beside.replace(out)
+            durable.rename(beside, out)
         except OSError as error:
             raise UserError(f"{paths.shown(out)}: {error.strerror}; make room, or name another place: OUT=") from error
         finally:

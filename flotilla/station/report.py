@@ -10,7 +10,7 @@ from pathlib import Path
 import jinja2
 import numpy as np
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.station import hops, mcap_reader, pictures, segments
 from flotilla.station.recording import Array
@@ -80,11 +80,9 @@ def write(given: Sequence[Path], page: Path) -> Path:
         pictures=list(pictures.of_robots(topics, begin_ns)),
         sections=[_section(topic, begin_ns) for topic in topics if topic.signals],
     )
-    beside = page.with_name(f"{page.name}.part")
     try:
         page.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text(text)
-        beside.replace(page)
+        durable.write(page, text)
     except OSError as error:
         raise UserError(f"{paths.shown(page)}: {error.strerror}; name another file: OUT=") from error
     return page

@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from flotilla.common import cache, paths, progress
+from flotilla.common import cache, durable, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.robot.release import Bundle, delta_of
 from images.builder import pool, tools
@@ -43,7 +43,7 @@ def make(base: Path, release: Path, delta: Path) -> None:
     if done.returncode != 0:
         unfinished.unlink(missing_ok=True)
         raise UserError(f"{delta}: xdelta3 failed (status {done.returncode}): {done.stderr.strip()}")
-    unfinished.replace(delta)
+    durable.rename(unfinished, delta)
 
 
 def between(old: Bundle, new: Bundle) -> Path | None:

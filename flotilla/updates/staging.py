@@ -11,7 +11,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
 from flotilla.robot import release
@@ -81,7 +81,7 @@ def _chunks(bundle: release.Bundle, numbers: list[int], directory: Path) -> Path
         with beside.open("wb") as out:
             for batch in bundle.chunks(numbers, 1 << 20):
                 out.write(batch)
-        beside.replace(file)
+        durable.rename(beside, file)
     return file
 
 

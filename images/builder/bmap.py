@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from flotilla.common import durable
 from flotilla.common.errors import UserError
 from flotilla.common.paths import shown
 
@@ -74,9 +75,7 @@ def block_map(image: Path, extents: Iterable[tuple[int, int]], known: Iterable[R
 def write_bmap(image: Path, extents: Iterable[tuple[int, int]], bmap: Path, known: Iterable[Range] = ()) -> BlockMap:
     """Write the map of `image`; arguments as for `block_map`."""
     result = block_map(image, extents, known)
-    beside = bmap.with_name(bmap.name + ".new")
-    beside.write_bytes(_xml(result))
-    beside.replace(bmap)
+    durable.write(bmap, _xml(result))
     return result
 
 

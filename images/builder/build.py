@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from flotilla.common import cache, host, namespace, paths, progress, together
+from flotilla.common import cache, durable, host, namespace, paths, progress, together
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity, release_keys
 from flotilla.fleet.apps import BuiltApp
@@ -193,8 +193,7 @@ def _robot_image(
             apps=apps, beside=new,
         )  # fmt: skip
         new.with_suffix(".sha256").write_text(f"{whole}  {final.name}\n")
-        for made_file in sorted(work.iterdir()):
-            made_file.rename(directory / made_file.name)
+        durable.rename_files(work, directory)
     finally:
         cache.discard(work)
     return f"{paths.shown(final)}: {progress.size(card.SIZE)}, {progress.size(mapped)} to write, sha256 {whole[:16]}…"

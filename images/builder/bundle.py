@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from flotilla.common import cache, host, namespace, paths, progress
+from flotilla.common import cache, durable, host, namespace, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import release_keys, ssh_signatures
 from flotilla.fleet.model import Board, Fleet, Releases
@@ -82,7 +82,7 @@ def pack(
             _add(archive, name, io.BytesIO(each), len(each), epoch)
         with (content / "slot.img").open("rb") as blob:
             _add(archive, "slot.img", blob, (content / "slot.img").stat().st_size, epoch)
-    new.rename(final)
+    durable.rename(new, final)
     return sorted(signed)
 
 

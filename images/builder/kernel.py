@@ -22,7 +22,7 @@ from pathlib import Path
 
 import pydantic
 
-from flotilla.common import cache, host, namespace, paths, progress, yaml_file
+from flotilla.common import cache, durable, host, namespace, paths, progress, yaml_file
 from flotilla.common.errors import Problem, ProblemsError, UserError
 from flotilla.fleet.model import Architecture, Board
 from images.builder import kernel_stage, pool, tools
@@ -320,6 +320,6 @@ def report(names: Sequence[str]) -> str:
             copy = paths.BUILD / "kernels" / name / package.name
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(package, copy.with_suffix(".part"))
-            copy.with_suffix(".part").replace(copy)
+            durable.rename(copy.with_suffix(".part"), copy)
             lines.append(f"{paths.shown(copy)}: {progress.size(copy.stat().st_size)}")
     return "\n".join(lines)

@@ -19,7 +19,7 @@ from urllib.parse import unquote
 
 import pydantic
 
-from flotilla.common import paths, progress, yaml_file
+from flotilla.common import durable, paths, progress, yaml_file
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Architecture, Board, System, Word
 from images.builder import mirror
@@ -343,9 +343,7 @@ def update_locks(recipes: Mapping[str, Recipe], mirrors: Mirrors | None = None, 
 
 def _write(path: Path, lock: Lock) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.new")
-    beside.write_text(format_lock(lock), encoding="utf-8")
-    beside.replace(path)
+    durable.write(path, format_lock(lock))
 
 
 def difference(old: Iterable[Package], new: Iterable[Package]) -> list[str]:

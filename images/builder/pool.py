@@ -14,7 +14,7 @@ from datetime import timedelta
 from pathlib import Path
 from urllib.parse import quote
 
-from flotilla.common import cache, paths, progress
+from flotilla.common import cache, durable, paths, progress
 from flotilla.common.errors import UserError
 from images.builder import deb, mirror
 from images.builder.lock import Lock, Package
@@ -222,7 +222,7 @@ def _fetch(address: str, package: Package, count: Callable[[int], None]) -> None
                 f"package {package}: {address} has SHA-256 {found} and {size} bytes, the lock says "
                 f"{package.sha256} and {package.size} bytes; try another mirror, or lock anew with `make lock`"
             )
-        beside.replace(file(package))
+        durable.rename(beside, file(package))
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import keys, ssh_signatures
 
@@ -78,10 +78,9 @@ def write(made: Acceptance) -> Path:
     """The file, `ROBOT-TIME.json`, with its signature beside it, `.json.sig`."""
     directory().mkdir(parents=True, exist_ok=True)
     file = directory() / f"{made.name}.json"
-    beside = file.with_suffix(".new")
-    beside.write_text(json.dumps(made.model_dump(mode="json"), indent=1, sort_keys=True) + "\n")
-    signature_of(file).write_bytes(ssh_signatures.sign(beside.read_bytes(), keys.operator(), NAMESPACE))
-    return beside.rename(file)
+    content = (json.dumps(made.model_dump(mode="json"), indent=1, sort_keys=True) + "\n").encode()
+    durable.write(signature_of(file), ssh_signatures.sign(content, keys.operator(), NAMESPACE))
+    return durable.write(file, content)
 
 
 def signature_of(file: Path) -> Path:

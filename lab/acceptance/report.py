@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jinja2
 
+from flotilla.common import durable
 from flotilla.station import figures
 from lab.acceptance import outcome
 from lab.acceptance.checks import BY_HAND
@@ -30,9 +31,7 @@ class Row:
 def write(made: Acceptance, others: Sequence[Acceptance]) -> Path:
     """`ROBOT-TIME.html` beside the signed file."""
     page = outcome.directory() / f"{made.name}.html"
-    beside = page.with_suffix(".new")
-    beside.write_text(render(made, others))
-    return beside.rename(page)
+    return durable.write(page, render(made, others))
 
 
 def render(made: Acceptance, others: Sequence[Acceptance]) -> str:

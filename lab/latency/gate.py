@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board
 from lab.latency import run, trace
@@ -160,9 +160,7 @@ def accept(found: Results, file: Path) -> None:
 def keep(file: Path, text: str) -> None:
     """Write a baseline; the one before stays until it is whole."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    beside = file.with_name(f".{file.name}.new")
-    beside.write_text(text)
-    beside.rename(file)
+    durable.write(file, text)
 
 
 def _moved(before: Outcome, after: Outcome) -> list[str]:

@@ -23,7 +23,7 @@ from typing import IO
 
 import yaml
 
-from flotilla.common import paths, progress
+from flotilla.common import durable, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet, Health, Robot
@@ -202,10 +202,8 @@ def hold(count: int, link: str | None = None) -> None:
                 shell.connect()
             stack.enter_context(ssh.announced(robot, ports[robot.name]))
             print(robot.name, flush=True)
-        beside = GUESTS.with_suffix(".new")
-        beside.write_text(guests_inventory(ports))
         stack.callback(GUESTS.unlink, missing_ok=True)
-        beside.rename(GUESTS)
+        durable.write(GUESTS, guests_inventory(ports))
         sys.stdout.close()
         os.close(1)
         # Not signal.pause(), which would miss a signal that comes just before it.

@@ -86,8 +86,43 @@ def test_what_a_killed_build_left_is_removed_by_the_next() -> None:
     left.mkdir(parents=True)
     (left / "half").touch()
     made = cache.result("kind", "0123456789abcdef", lambda out: (out / "whole").touch())
-    assert [path.name for path in made.iterdir()] == ["whole"]
+    assert sorted(path.name for path in made.iterdir()) == [".complete", "whole"]
     assert not left.exists()
+
+
+@pytest.mark.parametrize("damage", ["emptied", "gone", "no list", "short list"])
+def test_a_result_that_is_not_whole_is_made_anew(
+    damage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a power cut leaves it that came before results were synced. Seen to fail: whatever was there was taken."""
+
+    def make(out: Path) -> None:
+        (out / "directory").mkdir()
+        (out / "directory" / "file").write_text("content")
+        (out / "link").symlink_to("directory/file")
+
+    key = "0123456789abcdef"
+    made = cache.result("kind", key, make)
+    damages: dict[str, Callable[[], object]] = {
+        "emptied": lambda: os.truncate(made / "directory" / "file", 0),
+        "gone": lambda: (made / "link").unlink(),
+        "no list": lambda: (made / ".complete").unlink(),
+        "short list": lambda: os.truncate(made / ".complete", 5),
+    }
+    damages[damage]()
+    monkeypatch.setattr(cache, "_whole", set())  # the next process
+    assert not cache.has("kind", key)
+    assert (cache.result("kind", key, make) / "link").read_text() == "content"
+    assert cache.has("kind", key)
+    assert "kind-0123456789abcdef: is not whole, so it is made anew" in capsys.readouterr().err
+    assert not list(paths.CACHE.glob("*.part"))
+
+
+def test_a_file_that_a_user_of_a_result_added_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = cache.result("kind", "0123456789abcdef", lambda out: (out / "file").touch())
+    (made / "file.pyc").touch()
+    monkeypatch.setattr(cache, "_whole", set())
+    assert cache.has("kind", "0123456789abcdef")
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from flotilla.cli import main as command_line
-from flotilla.common import paths
+from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity, key_backup, keys, operators
 from flotilla.fleet.model import Fleet
@@ -301,7 +301,7 @@ def test_a_list_that_cannot_be_read_is_named(fleet: Fleet, alice: Path, content:
 
 def test_whatever_is_handed_out_is_on_the_list(fleet: Fleet, alice: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupted before each of the files. Seen to fail with the list written last."""
-    write = keys.write
+    write = durable.write
     for interrupted_at in (1, 2, 3):
         written: list[Path] = []
 
@@ -312,7 +312,7 @@ def test_whatever_is_handed_out_is_on_the_list(fleet: Fleet, alice: Path, monkey
             write(file, text)
 
         with monkeypatch.context() as patch:
-            patch.setattr(keys, "write", interrupted)
+            patch.setattr(durable, "write", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 admit(fleet, "alice", alice)
         listed = (paths.KEYS / "operators").exists()

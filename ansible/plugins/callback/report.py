@@ -15,7 +15,7 @@ from typing import Any
 import jinja2
 
 from ansible.plugins.callback import CallbackBase
-from flotilla.common import paths
+from flotilla.common import durable, paths
 
 DOCUMENTATION = """
 name: report
@@ -82,9 +82,7 @@ class CallbackModule(CallbackBase):  # type: ignore[misc]  # Ansible has no type
         page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
         html = page.from_string(TEMPLATE.read_text(encoding="utf-8")).render(document)
         for name, text in (("json", json.dumps(document, indent=1, sort_keys=True) + "\n"), ("html", html)):
-            beside = directory / f".{self._playbook}.{name}"
-            beside.write_text(text)
-            beside.rename(directory / f"{self._playbook}.{name}")
+            durable.write(directory / f"{self._playbook}.{name}", text)
         self._display.display(f"{paths.shown(directory / self._playbook)}.html")
 
     def _robot(self, result: Any) -> dict[str, Any]:
