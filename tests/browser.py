@@ -20,7 +20,7 @@ _OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--disable-quic",
 )  # fmt: skip
-_TIMEOUT_S = 60
+_TIMEOUT_S = 300
 _LISTENING = "DevTools listening on "
 _OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 _EMPTY = (

@@ -17,8 +17,8 @@ from typing import Any
 
 from lab.qemu.ssh import Ssh
 
-PATIENCE = 60
-"""Seconds, for what takes well under one: the machine may be busy."""
+PATIENCE = 300
+"""Seconds, for what takes well under one: the machine may be slow and busy, and a guest on it slower still."""
 
 DDS_ON_LOOPBACK = """
 <CycloneDDS><Domain Id="any">

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 RELAYS = 20
 INPUTS = 20
 REGISTERS = 8
+PATIENCE_S = 600
+"""Limit for what a guest does within one on an idle host."""
 
 _RELAYS_AT = 0
 _INPUTS_AT = 4
@@ -81,7 +83,7 @@ class Ir104:
         with self.lock:
             return self.lock.wait_for(what, timeout)
 
-    def wait_relays(self, *, on: bool, timeout: float = 60) -> bool:
+    def wait_relays(self, *, on: bool, timeout: float = PATIENCE_S) -> bool:
         """Wait until some relay is on, or all are off."""
         return self.wait(lambda: any(self.relays) == on, timeout)
 

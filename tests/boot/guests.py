@@ -27,6 +27,11 @@ def sh(robot: RobotGuest, script: str, *, check: bool = True, timeout: float = S
     return robot.shell.script(script, check=check, timeout=timeout).stdout.strip()
 
 
+def until(robot: RobotGuest, condition: str) -> None:
+    """Wait until a shell command succeeds as root. Only the host's limit ends it: a busy host makes the guest slow."""
+    sh(robot, f"until {condition}; do sleep 0.2; done")
+
+
 def call(robot: RobotGuest, program: ModuleType, *arguments: object, timeout: float = SECONDS) -> Any:
     """What `main` of a module of `probes` returns, which runs there as root; it imports the standard library alone."""
     source = Path(str(program.__file__)).read_text()

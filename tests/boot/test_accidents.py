@@ -13,7 +13,7 @@ from images.builder import card, environment_block, tools
 from images.builder.lock import read_lock
 from images.builder.tools import Tools
 from lab.qemu import qemu
-from tests.boot.guests import PENTIUM, SECONDS, boot_state, has_its_identity, nothing_failed, sh, tries
+from tests.boot.guests import PENTIUM, SECONDS, boot_state, has_its_identity, nothing_failed, sh, tries, until
 from tests.conftest import GuestFactory, RobotGuest
 
 
@@ -30,9 +30,8 @@ def test_power_cut_while_writing(fresh_guest: GuestFactory, fleet: Fleet, toolse
     writer = 'n=0; while :; do n=$((n+1)); echo "line $n" >>/data/lines; sync /data/lines; '
     writer += "dd if=/dev/urandom of=/data/bulk-$((n % 8)) bs=64k count=8 status=none; done"
     robot.shell.run(["sudo", "systemd-run", "--quiet", "sh", "-c", writer])
-    count = int(
-        sh(robot, "timeout 50 sh -c 'until grep -q \"line 20\" /data/lines; do sleep 0.1; done' && wc -l </data/lines")
-    )
+    until(robot, "grep -q 'line 20' /data/lines")
+    count = int(sh(robot, "wc -l </data/lines"))
     robot.machine.cut()
 
     robot.machine.on()

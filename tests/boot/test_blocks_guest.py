@@ -359,11 +359,8 @@ def queue() -> str:
 Wanted = Mapping[str, Callable[[Row], bool]]
 
 
-def seen(task: Task, wanted: Wanted, seconds: float = 40) -> dict[str, Row]:
-    """For each block its part of the first row in which that is as wanted; without those that have none in time.
-
-    20 s have been seen to be too few for the network of a guest on a host that is twice as busy as it can be.
-    """
+def seen(task: Task, wanted: Wanted, seconds: float = PATIENCE / 2) -> dict[str, Row]:
+    """For each block its part of the first row in which that is as wanted; without those that have none in time."""
     found: dict[str, Row] = {}
     end = time.monotonic() + seconds
     for row in task.rows():

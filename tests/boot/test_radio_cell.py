@@ -289,6 +289,6 @@ def test_twelve_robots_on_another_subnet_and_channel(twelve: Path, tmp_path: Pat
         peers = " ".join(str(one.address) for one in [*robots, *fleet.stations])
         for robot in robots:
             shell = shells[robot.name]
-            shell.script(f"for peer in {peers}; do ping -q -c 1 -w 60 $peer || exit; done", timeout=4 * SECONDS)
+            shell.script(f"for peer in {peers}; do ping -q -c 1 -w {SECONDS} $peer || exit; done", timeout=4 * SECONDS)
             assert "freq: 2462" in shell.script("iw dev wlan0 link").stdout
             assert str(robot.address) in shell.script("ip -4 address show dev wlan0").stdout

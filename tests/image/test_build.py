@@ -104,7 +104,7 @@ def _gone(pids: set[int]) -> bool:
             descriptor = os.pidfd_open(pid)
         except ProcessLookupError:
             continue
-        ended = select.select([descriptor], [], [], 10)[0]
+        ended = select.select([descriptor], [], [], _PATIENCE_S)[0]
         os.close(descriptor)
         if not ended:
             return False
@@ -117,7 +117,7 @@ def test_an_interrupted_build_leaves_the_last_good_image_and_nothing_else(
     pids = _processes(build)
     assert len(pids) >= 2, "the negative control: a running build is seen"
     os.killpg(running.pid, signal.SIGINT)
-    _, errors = running.communicate(timeout=30)
+    _, errors = running.communicate(timeout=_PATIENCE_S)
     assert running.returncode == 130, errors
     assert "interrupted; the last good outputs are untouched" in errors
     assert _gone(pids)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +20,8 @@ from flotilla.fleet.model import Board, Fleet
 from flotilla.robot import ssh
 from lab.emulators.ir104 import Ir104
 from lab.qemu.relay_ports import RelayPorts
+from lab.qemu.ssh import COMMAND_SECONDS
+from lab.qemu.timing import Deadline
 from tests.conftest import GuestFactory, RobotGuest
 from tests.running import judged_by_outcomes
 
@@ -184,8 +185,8 @@ def test_a_step_that_spins_without_end_is_ended_until_it_is_given_up(bench: Benc
     bench.place(directory)
     before = len(bench.relays.log)
     bench.do("spinning", "start")
-    end = time.monotonic() + 120
-    while (status := bench.status("spinning"))["ActiveState"] != "failed" and time.monotonic() < end:
+    deadline = Deadline(COMMAND_SECONDS)
+    while (status := bench.status("spinning"))["ActiveState"] != "failed" and not deadline.expired:
         pass  # asking takes a second
     assert status["ActiveState"] == "failed", status
     # Whoever waits for them to be on may come too late.
@@ -224,8 +225,8 @@ def test_an_app_that_leaks_is_killed_and_nothing_else(bench: Bench) -> None:
     (directory / "app.yml").write_text("kind: make\nprogram: leaking\n")
     bench.place(directory)
     bench.guest.shell.run(["sudo", "systemctl", "start", "--no-block", "flotilla-app@leaking"])
-    end = time.monotonic() + 300
-    while (status := bench.status("leaking"))["ActiveState"] != "failed" and time.monotonic() < end:
+    deadline = Deadline(COMMAND_SECONDS)
+    while (status := bench.status("leaking"))["ActiveState"] != "failed" and not deadline.expired:
         pass  # asking takes a second
     assert status["ActiveState"] == "failed", status
     kernel = bench.guest.shell.run(["sudo", "journalctl", "-k", "-b", "-o", "cat"]).stdout

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 from unittest import mock
 
 import pytest
@@ -60,6 +60,8 @@ def test_an_interrupt_ends_the_app(said: dict[str, Any], moment: str) -> None:
 
 
 def test_a_second_interrupt_ends_it_too(said: dict[str, Any]) -> None:
+    """It comes when the first one has closed the run's input. Seen to fail when it came with a line of the log: on a
+    slow host the robot had cancelled the start, and there was none."""
     assert said["twice"]["state"] == "inactive", said["twice"]
     assert said["twice"]["status"] == 130
     assert "interrupted; robot1: hover is inactive, version " in said["twice"]["err"]
@@ -168,10 +170,19 @@ def deploy(directory: Path, moment: str, argv: Sequence[str]) -> int:
     """The command line, interrupted by itself at a moment."""
     fleet = inventory.load_fleet(directory)
 
-    again: list[str] = []
-
     def interrupt() -> None:
         os.kill(os.getpid(), signal.SIGINT)
+
+    class InterruptedAgain:
+        """The run's input, which an interrupt closes: the second interrupt comes with that, whatever the robot does."""
+
+        def __init__(self, file: Any) -> None:
+            self._file = file
+
+        def close(self) -> None:
+            if not self._file.closed:
+                self._file.close()
+                interrupt()
 
     def build(subject: app.App, _: Board, out: Path, *_run: object) -> None:
         assert isinstance(subject.description, app.Make)
@@ -189,15 +200,16 @@ def deploy(directory: Path, moment: str, argv: Sequence[str]) -> int:
             if runs and moment == "before":
                 interrupt()
             super().__init__(argv, **options)
-            if runs and moment in ("at once", "twice"):
+            if runs and moment == "at once":
                 interrupt()
+            if runs and moment == "twice":
+                self.stdin = cast(IO[Any], InterruptedAgain(self.stdin))
             if "flotilla receive hover" in argv[-1] and moment == "sending":
                 interrupt()
 
     def show(line: str, **options: Any) -> None:
         real_print(line, **options)
-        if (line == "runs" and moment == "running") or (line.startswith("St") and moment == "twice" and not again):
-            again.append(line)
+        if line == "runs" and moment in ("running", "twice"):
             interrupt()
 
     def send(*arguments: Any) -> None:

@@ -94,7 +94,7 @@ def test_nothing_stays_of_a_run_that_was_ended(ended_by: signal.Signals) -> None
         os.killpg(run.pid, ended_by)
     else:
         run.kill()
-    _, said = run.communicate(timeout=60)
+    _, said = run.communicate(timeout=RUN_SECONDS)
     assert run.returncode == (130 if ended_by == signal.SIGINT else -ended_by), said
     wait_until(lambda: not [found for found in left() - before if not found.startswith("control group")])
     container.clean()
@@ -106,7 +106,7 @@ def scale_command(*argv: str) -> list[str]:
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = Deadline(60)
+    deadline = Deadline(RUN_SECONDS)
     while not condition():
         assert not deadline.expired
         time.sleep(0.05)

@@ -49,7 +49,8 @@ def dds(pentium: RobotGuest, fleet: Fleet) -> dict[str, Any]:
     runs = {"shipped": (shipped, 2), "changed": (changed, 2), "alone": (alone, 1), "greedy": (greedy, 1)}
     domain = fleet.network.dds_domain
     return {
-        name: call(pentium, observe_dds, text, domain, count, 3, timeout=180) for name, (text, count) in runs.items()
+        name: call(pentium, observe_dds, text, domain, count, 3, timeout=2 * observe_dds.FOUND_S)
+        for name, (text, count) in runs.items()
     }
 
 

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from flotilla.fleet import identity
 from flotilla.fleet.model import Fleet
 from flotilla.station import adapter
-from tests.boot.guests import sh
+from tests.boot.guests import SECONDS, sh, until
 from tests.conftest import RobotGuest
 
 
@@ -29,7 +29,7 @@ def test_radio_joins_the_cell_whenever_it_is_plugged_in(pentium: RobotGuest, fle
         sh(pentium, "udevadm control --reload")
         for plugged in ("plugged in", "plugged in again"):
             sh(pentium, "modprobe mac80211_hwsim radios=2")
-            sh(pentium, "timeout 30 sh -c 'until systemctl -q is-active flotilla-ibss@wlan0; do sleep 0.2; done'")
+            until(pentium, "systemctl -q is-active flotilla-ibss@wlan0")
             link = sh(pentium, "iw dev wlan0 link")
             assert cell in link, f"{plugged}: {link}"
             assert f"SSID: {fleet.network.ibss.ssid}" in link, f"{plugged}: {link}"
@@ -39,7 +39,7 @@ def test_radio_joins_the_cell_whenever_it_is_plugged_in(pentium: RobotGuest, fle
                 "the radio that no unit was started for joined too"
             )
             sh(pentium, "modprobe -r mac80211_hwsim")
-            sh(pentium, "timeout 30 sh -c 'while systemctl -q is-active flotilla-ibss@wlan0; do sleep 0.2; done'")
+            until(pentium, "! systemctl -q is-active flotilla-ibss@wlan0")
     finally:
         sh(pentium, "rm -f /etc/flotilla/ibss.conf /run/udev/rules.d/71-a-test.rules; udevadm control --reload")
         sh(pentium, "modprobe -r mac80211_hwsim cfg80211; systemctl reset-failed", check=False)
@@ -83,7 +83,7 @@ case "$*" in *DEVICE,STATE*) echo wlan1:disconnected ;; esac
         before = state()
         assert program("join", json.dumps(wanted)) == "wlan1"
         assert f"Joined IBSS {ibss.bssid}" in sh(pentium, "iw dev wlan1 link")
-        assert "1 received" in sh(pentium, "ping -c 1 -w 20 192.0.2.1")
+        assert "1 received" in sh(pentium, f"ping -c 1 -w {SECONDS} 192.0.2.1")
         assert "device set wlan1 managed no" in sh(pentium, "cat /run/desk/asked")
         assert program("leave") == "wlan1"
         assert state() == before

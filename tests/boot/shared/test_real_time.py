@@ -9,7 +9,7 @@ import time
 from flotilla.fleet import identity
 from flotilla.fleet.model import Board, Fleet
 from flotilla.robot import hwcheck
-from tests.boot.guests import label, sh
+from tests.boot.guests import label, sh, until
 from tests.boot.shared.conftest import Report
 from tests.conftest import RobotGuest
 
@@ -67,7 +67,7 @@ def test_isolated_processors_are_left_to_control_tasks(robot: RobotGuest, board:
     task = "period: 10 ms\npriority: 80\ncpu: {}\nblocks:\n  a: {{type: gain, in: {{in: 1}}}}\n"
     script = (
         "cat >/run/one.yml; flotilla-run /run/one.yml & pid=$!; "
-        'timeout 60 sh -c "until grep -q guard /proc/$pid/task/*/comm; do :; done"; '
+        "while [ -e /proc/$pid ] && ! grep -q guard /proc/$pid/task/*/comm; do sleep 0.1; done; "
         "cat /proc/$pid/task/*/status; kill $pid; wait $pid"
     )
     for processor in range(board.processors):
@@ -119,6 +119,6 @@ def test_clock_follows_the_fleet(robot: RobotGuest, fleet: Fleet) -> None:
     sources = {line.split(",")[2] for line in sh(robot, "chronyc -n -c sources").splitlines()}
     assert sources == others
     # Alone, it leads, at the stratum of orphans, once the others did not answer.
-    sh(robot, "timeout 60 sh -c 'until chronyc -n tracking | grep -q 7F7F0101; do sleep 0.5; done'", timeout=90)
+    until(robot, "chronyc -n tracking | grep -q 7F7F0101")
     reference, _, stratum, *_ = sh(robot, "chronyc -n -c tracking").split(",")
     assert (reference, stratum) == ("7F7F0101", "10"), "not in orphan mode"

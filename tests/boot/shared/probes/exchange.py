@@ -7,6 +7,9 @@ import select
 import time
 import tty
 
+PATIENCE_S = 600
+"""For what takes well under one on an idle host."""
+
 
 def main(lines: dict[str, str]) -> dict[str, str]:
     """Write a line to each port, then read one from each, all open at once."""
@@ -15,7 +18,7 @@ def main(lines: dict[str, str]) -> dict[str, str]:
     for name, port in ports.items():
         tty.setraw(port)
         os.write(port, lines[name].encode())
-    end = time.monotonic() + 20
+    end = time.monotonic() + PATIENCE_S
     while (left := end - time.monotonic()) > 0 and not all(line.endswith(b"\n") for line in received.values()):
         readable, _, _ = select.select(list(ports.values()), [], [], left)
         for name, port in ports.items():

@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-FOUND_S = 90
+FOUND_S = 600
 """For the two to find each other and send on a busy host."""
 
 
