@@ -10,6 +10,7 @@ import ctypes
 import errno
 import os
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -23,10 +24,11 @@ def rename(new: Path, final: Path) -> Path:
     return final
 
 
-def rename_files(directory: Path, place: Path) -> None:
-    """Move the files of a directory, all of them complete, into another one."""
-    _sync(directory)
-    for new in sorted(directory.iterdir()):
+def rename_files(files: Sequence[Path], place: Path) -> None:
+    """Move complete files of one directory into another one."""
+    if files:
+        _sync(files[0].parent)
+    for new in files:
         new.replace(place / new.name)
     sync_names(place)
 

@@ -193,7 +193,7 @@ def _robot_image(
             apps=apps, beside=new,
         )  # fmt: skip
         new.with_suffix(".sha256").write_text(f"{whole}  {final.name}\n")
-        durable.rename_files(work, directory)
+        durable.rename_files(sorted(work.iterdir()), directory)
     finally:
         cache.discard(work)
     return f"{paths.shown(final)}: {progress.size(card.SIZE)}, {progress.size(mapped)} to write, sha256 {whole[:16]}…"

@@ -7,34 +7,24 @@ import hashlib
 import os
 import re
 import shutil
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from urllib.parse import quote
 
 from flotilla.common import cache, durable, paths, progress
 from flotilla.common.errors import UserError
-from images.builder import deb, mirror
+from images.builder import deb, download, mirror
+from images.builder.download import Failure, Kind
 from images.builder.lock import Lock, Package
 from images.builder.mirror import Mirrors
 
-_CONNECTIONS = 8
-_ATTEMPTS = 3
-_TIMEOUT = 30.0
-_CHUNK = 1 << 18
-_GONE = (404, 410)
 _SNAPSHOT_DELAYS = (timedelta(0), timedelta(days=1))
 """A snapshot archive answers with its last copy before a time, older perhaps than the release of that very time."""
-
-
-class _GoneError(Exception):
-    """The server no longer has the file."""
-
-
-class _NoSpaceError(UserError):
-    """The disk is full: no other download can do better."""
+_Wanted = Mapping[str, tuple[Lock, Package]]
+"""Packages by their hashes, and a lock that names each."""
 
 
 def file(package: Package) -> Path:
@@ -43,35 +33,33 @@ def file(package: Package) -> Path:
 
 
 def fill(locks: Iterable[Lock], mirrors: Mirrors | None = None) -> None:
-    """Download what the locks name and the pool lacks. Contents of what is there are the matter of `verify_hashes`."""
+    """Download what the locks name and the pool lacks, or has at another size. See also `verify_hashes`."""
     wanted = {package.sha256: (lock, package) for lock in locks for package in lock.packages}
     if not _missing(wanted):
         return
     mirrors = mirrors or mirror.resolve()
     with cache.locked(paths.POOL / ".lock"):  # of two builds at once, the second finds the first one's packages
+        _remove_damaged(package for _, package in wanted.values() if _size(package) not in (None, package.size))
         missing = _missing(wanted)
+        if not missing:
+            return
         if not mirrors.snapshot:
-            for archive in {package.archive for _, package in missing}:
+            for archive in {package.archive for _, package in missing.values()}:
                 mirrors.of(archive)
-        total = sum(package.size for _, package in missing)
+        total = sum(package.size for _, package in missing.values())
         with progress.step(f"downloading {len(missing)} packages, {progress.size(total)}") as step:
-            _download_all(missing, mirrors, lambda done: step.at(done >> 20, total >> 20, "MiB"))
+            _download(missing, mirrors, lambda done: step.at(done >> 20, total >> 20, "MiB"))
 
 
 def verify_hashes(lock: Lock) -> None:
-    """Compare the content of every package of a lock in the pool with the lock."""
+    """Compare the content of every package of a lock in the pool with the lock. A damaged one is downloaded anew."""
     absent = [package for package in lock.packages if not file(package).is_file()]
     if absent:
         raise UserError("\n".join(f"package {package}: missing in {paths.shown(paths.POOL)}" for package in absent))
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        found = threads.map(_hash, [file(package) for package in lock.packages])
-    wrong = [
-        _corrupt(package, sha256)
-        for package, sha256 in zip(lock.packages, found, strict=True)
-        if sha256 != package.sha256
-    ]
-    if wrong:
-        raise UserError("\n".join(wrong))
+    if _damaged(lock.packages):
+        with cache.locked(paths.POOL / ".lock"):
+            _remove_damaged(_damaged(lock.packages))
+        fill([lock])
 
 
 def repository(lock: Lock, directory: Path, *, compressed: bool = True) -> None:
@@ -110,27 +98,30 @@ def repository(lock: Lock, directory: Path, *, compressed: bool = True) -> None:
 # --- pool ---
 
 
-def _missing(wanted: dict[str, tuple[Lock, Package]]) -> list[tuple[Lock, Package]]:
-    """What the pool lacks; an error for what it holds at another size."""
-    missing, wrong = [], []
-    for lock, package in wanted.values():
-        try:
-            size = file(package).stat().st_size
-        except FileNotFoundError:
-            missing.append((lock, package))
-            continue
-        if size != package.size:
-            wrong.append(_corrupt(package, _hash(file(package))))
-    if wrong:
-        raise UserError("\n".join(wrong))
-    return missing
+def _size(package: Package) -> int | None:
+    """In the pool; None: it is not there."""
+    try:
+        return file(package).stat().st_size
+    except FileNotFoundError:
+        return None
 
 
-def _corrupt(package: Package, found: str) -> str:
-    return (
-        f"package {package}: {paths.shown(file(package))} has SHA-256 {found}, the lock says {package.sha256}; "
-        "delete the file and run again"
-    )
+def _missing(wanted: _Wanted) -> dict[str, tuple[Lock, Package]]:
+    return {sha256: each for sha256, each in wanted.items() if _size(each[1]) != each[1].size}
+
+
+def _damaged(packages: Iterable[Package]) -> list[Package]:
+    """Those that the pool has with other content."""
+    there = [package for package in packages if file(package).is_file()]
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        found = threads.map(_hash, [file(package) for package in there])
+    return [package for package, sha256 in zip(there, found, strict=True) if sha256 != package.sha256]
+
+
+def _remove_damaged(packages: Iterable[Package]) -> None:
+    for package in packages:
+        progress.say(f"package {package}: {paths.shown(file(package))} is damaged; it is removed and downloaded anew")
+        file(package).unlink()
 
 
 def _hash(path: Path) -> str:
@@ -141,88 +132,18 @@ def _hash(path: Path) -> str:
 # --- download ---
 
 
-def _download_all(missing: list[tuple[Lock, Package]], mirrors: Mirrors, report: Callable[[int], None]) -> None:
-    """Download in parallel; every package that could not be had is in the one error at the end."""
-    done = 0
-    mutex = threading.Lock()
-
-    def count(size: int) -> None:
-        nonlocal done
-        with mutex:
-            done += size
-            report(done)
-
-    failures: list[str] = []
-    with ThreadPoolExecutor(_CONNECTIONS) as threads:
-        running = [threads.submit(_download, lock, package, mirrors, count) for lock, package in missing]
-        try:
-            for future in as_completed(running):
-                try:
-                    future.result()
-                except _NoSpaceError:
-                    raise
-                except UserError as error:
-                    failures.append(str(error))
-        except BaseException:
-            threads.shutdown(cancel_futures=True)
-            raise
-    if failures:
-        raise UserError("\n".join(sorted(failures)))
-
-
-def _download(lock: Lock, package: Package, mirrors: Mirrors, count: Callable[[int], None]) -> None:
-    tried = []
-    for base in _bases(lock, package, mirrors):
-        address = f"{base}/{quote(package.path, safe='/+~')}"
-        tried.append(address)
-        try:
-            return _fetch(address, package, count)
-        except _GoneError:
-            continue
-    places = " nor ".join(tried)
-    remedy = (
-        "lock the version of today with `make lock`"
-        if mirrors.snapshot
-        else "lock the version of today with `make lock`, or set SNAPSHOT= to a snapshot archive (http://SNAPSHOT/archive)"
-    )
-    raise UserError(f"package {package}: not at {places} any more; {remedy}")
-
-
-def _bases(lock: Lock, package: Package, mirrors: Mirrors) -> Iterator[str]:
-    """Where a package may be, the likeliest place first."""
-    if package.archive in mirrors.archives:
-        yield mirrors.archives[package.archive]
-    if mirrors.snapshot:
-        for delay in _SNAPSHOT_DELAYS:
-            time = lock.date(package.archive) + delay
-            yield f"{mirrors.snapshot}/{package.archive}/{time:%Y%m%dT%H%M%SZ}"
-
-
-def _fetch(address: str, package: Package, count: Callable[[int], None]) -> None:
-    """Download one package beside its place in the pool and move it there once size and hash are right."""
-    import http.client  # here, because it takes a while, and a full pool needs no network
-    import urllib.error
-
-    beside = file(package).with_suffix(".part")
+def _download(missing: _Wanted, mirrors: Mirrors, report: Callable[[int], None]) -> None:
+    """Download; every package that could not be had is in the one error at the end."""
+    incoming = paths.POOL / ".incoming"
+    incoming.mkdir(parents=True, exist_ok=True)
+    packages = [package for _, package in missing.values()]
+    _take(packages, incoming)  # that a build which was killed has left
+    wanted = {
+        download.File(f"{sha256}.deb", tuple(_addresses(lock, package, mirrors)), sha256, package.size): package
+        for sha256, (lock, package) in _missing(missing).items()
+    }
     try:
-        for attempt in range(1, _ATTEMPTS + 1):  # networks fail in passing
-            try:
-                found, size = _receive(address, beside, count)
-                break
-            except urllib.error.HTTPError as error:
-                if error.code in _GONE:
-                    raise _GoneError from None
-                reason = str(error)
-            except (http.client.HTTPException, urllib.error.URLError, TimeoutError, ConnectionError) as error:
-                reason = str(error)
-            if attempt == _ATTEMPTS:
-                raise UserError(f"package {package}: {address}: {reason}; run again, or set another mirror")
-        if (found, size) != (package.sha256, package.size):
-            raise UserError(
-                f"package {package}: {address} has SHA-256 {found} and {size} bytes, the lock says "
-                f"{package.sha256} and {package.size} bytes; try another mirror, or lock anew with `make lock`"
-            )
-        durable.rename(beside, file(package))
+        failed = download.fetch(wanted, incoming, report)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
@@ -230,25 +151,51 @@ def _fetch(address: str, package: Package, count: Callable[[int], None]) -> None
             f"no space left for {paths.shown(paths.POOL)}; make room, or set BUILD= to another disk"
         ) from None
     finally:
-        beside.unlink(missing_ok=True)
+        _take(packages, incoming)
+    if failed:
+        raise UserError("\n".join(_reasons({wanted[each]: failure for each, failure in failed.items()}, mirrors)))
 
 
-def _receive(address: str, beside: Path, count: Callable[[int], None]) -> tuple[str, int]:
-    """Hash and size of what came."""
-    import http.client
-    import urllib.request
+def _take(packages: Iterable[Package], incoming: Path) -> None:
+    """Move to the pool what has come as the lock says."""
+    came = {package: incoming / file(package).name for package in packages}
+    whole = [
+        path
+        for package, path in came.items()
+        if path.is_file() and path.stat().st_size == package.size and _hash(path) == package.sha256
+    ]
+    durable.rename_files(whole, paths.POOL)
 
-    digest, size = hashlib.sha256(), 0
-    with urllib.request.urlopen(address, timeout=_TIMEOUT) as answer, beside.open("wb") as part:
-        while chunk := answer.read(_CHUNK):
-            part.write(chunk)
-            digest.update(chunk)
-            size += len(chunk)
-            count(len(chunk))
-        expected = answer.headers.get("Content-Length")
-    if expected and size < int(expected):
-        raise http.client.IncompleteRead(b"", int(expected) - size)
-    return digest.hexdigest(), size
+
+def _addresses(lock: Lock, package: Package, mirrors: Mirrors) -> Iterator[str]:
+    """Where a package may be, the likeliest place first."""
+    path = quote(package.path, safe="/+~")
+    if package.archive in mirrors.archives:
+        yield f"{mirrors.archives[package.archive]}/{path}"
+    if mirrors.snapshot:
+        for delay in _SNAPSHOT_DELAYS:
+            time = lock.date(package.archive) + delay
+            yield f"{mirrors.snapshot}/{package.archive}/{time:%Y%m%dT%H%M%SZ}/{path}"
+
+
+def _reasons(failed: Mapping[Package, Failure], mirrors: Mirrors) -> Iterator[str]:
+    """Why packages did not come: a line for each that the archive no longer has, one for all that share a reason."""
+    alike: dict[tuple[str, Kind], list[Package]] = defaultdict(list)
+    for package in sorted(failed):
+        failure = failed[package]
+        if failure.kind is download.GONE:
+            yield f"package {package}: not at {' nor '.join(failure.tried)} any more; {_remedy_of_gone(mirrors)}"
+        else:
+            alike[failure.host, failure.kind].append(package)
+    for packages in alike.values():
+        failure = failed[packages[0]]
+        others = f" and {len(packages) - 1} others" if packages[1:] else ""
+        yield f"package {packages[0]}{others}: {failure.address}: {failure.reason}; {failure.kind.remedy}"
+
+
+def _remedy_of_gone(mirrors: Mirrors) -> str:
+    snapshot = "" if mirrors.snapshot else ", or set SNAPSHOT= to a snapshot archive (http://SNAPSHOT/archive)"
+    return f"lock the version of today with `make lock`{snapshot}"
 
 
 # --- repository ---
@@ -259,7 +206,9 @@ def control(package: Package) -> str:
     try:
         return deb.control(file(package))
     except ValueError as error:
-        raise UserError(f"package {package}: {error}; delete {paths.shown(file(package))} and run again") from error
+        raise UserError(
+            f"package {package}: {error}; {paths.shown(file(package))} is no package: `make lock`"
+        ) from error
 
 
 def _stanza(package: Package, size: int, sha256: str) -> str:

@@ -65,7 +65,7 @@ def test_files_beside_each_other_are_synced_by_one_call(tmp_path: Path, calls: l
     (tmp_path / "new").mkdir()
     for name in ("a", "b"):
         (tmp_path / "new" / name).touch()
-    durable.rename_files(tmp_path / "new", tmp_path)
+    durable.rename_files(sorted((tmp_path / "new").iterdir()), tmp_path)
     assert calls == ["syncfs new", "replace a a", "replace b b", f"fsync {tmp_path.name}"]
 
 
