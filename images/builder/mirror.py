@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,12 +22,13 @@ ARCHIVES = (DEBIAN, SECURITY)
 
 _VARIABLES = {DEBIAN: "MIRROR", SECURITY: "SECURITY_MIRROR"}
 _EXAMPLES = {DEBIAN: "http://MIRROR/debian", SECURITY: "http://MIRROR/debian-security"}
-_ALWAYS = r"sid|(old)*stable|testing|unstable"
+_ALWAYS = r"sid|(?:old)*stable|testing|unstable"
 """What Debian calls suites besides the names of releases. Those are data: this computer's says os-release."""
 _SCHEMES = ("http://", "https://", "file:/")
 _MIRROR_LIST = "mirror+file:"
+_LABELS = {"Debian": DEBIAN, "Debian-Security": SECURITY}
+"""Of the archives' Release files, whose origin is `Debian`."""
 _FIELD = re.compile(r"^([!-9;-~]+):[ \t]*(.*(?:\n[ \t].*)*)", re.MULTILINE)
-_ONE_LINE = re.compile(r"deb\s+(?:\[.*?\]\s+)?(\S+)\s+(\S+)\s+(.+)")
 
 
 @dataclass(frozen=True)
@@ -51,16 +54,15 @@ def resolve(
     os_release: Path = Path("/etc/os-release"),
 ) -> Mirrors:
     """The mirrors to use. One that is missing is an error only when it is needed: see `Mirrors.of`."""
-    names = _suites(os_release)
-    found = dict(_configured(apt, names)) if names else {}
-    for archive, variable in _VARIABLES.items():
-        if address := environment.get(variable):
-            if not address.startswith(_SCHEMES):
-                raise UserError(f"{variable}={address}: no address; write it like {variable}={_EXAMPLES[archive]}")
-            found[archive] = address
+    given = {archive: environment[variable] for archive, variable in _VARIABLES.items() if environment.get(variable)}
+    for archive, address in given.items():
+        if not address.startswith(_SCHEMES):
+            variable = _VARIABLES[archive]
+            raise UserError(f"{variable}={address}: no address; write it like {variable}={_EXAMPLES[archive]}")
+    known = {} if given.keys() == set(ARCHIVES) else dict(_configured(apt, _suites(os_release)))
     snapshot = environment.get("SNAPSHOT") or None
     return Mirrors(
-        {archive: address.rstrip("/") for archive, address in found.items()},
+        {archive: address.rstrip("/") for archive, address in (known | given).items()},
         snapshot.rstrip("/") if snapshot else None,
     )
 
@@ -82,7 +84,7 @@ def _advice(archive: str) -> str:
 
 
 def _suites(os_release: Path) -> str:
-    """A pattern of the names that suites of this computer's Debian have; none elsewhere, where sources are others'."""
+    """A pattern of the names that suites of this computer's Debian have; none elsewhere, where suites are others'."""
     text = os_release.read_text() if os_release.is_file() else ""
     values = dict(re.findall(r"""^(\w+)=["']?(.*?)["']?$""", text, re.MULTILINE))
     if values.get("ID") != "debian":
@@ -94,38 +96,55 @@ def _suites(os_release: Path) -> str:
 def _configured(apt: Path, names: str) -> Iterator[tuple[str, str]]:
     """Archive and address of every source of Debian's that apt knows, the most preferred last.
 
+    Who publishes a source is in its Release file, which apt has verified and kept. Where apt has none yet, the names of
+    the suites and the address decide: others call their suites `stable` and their components `main`, too.
     An archive's suites share one pool, so any of them will do.
     """
-    patterns = {DEBIAN: re.compile(f"({names})(-updates)?"), SECURITY: re.compile(f"({names})-security")}
-    for address, suites, components in reversed(list(_sources(apt))):
-        for archive, pattern in patterns.items():
-            if "main" in components and any(pattern.fullmatch(suite) for suite in suites):
-                for usable in _usable(address, apt):
+    published: dict[str, set[str]] = defaultdict(set)
+    for address, origin, label in _index_targets(apt, ["ORIGIN", "LABEL"]):
+        published[address].add(_LABELS.get(label, "") if origin == "Debian" else "")
+    suites: dict[str, set[str]] = defaultdict(set)
+    for address, suite, component in _index_targets(apt, ["RELEASE", "COMPONENT"], "--no-release-info"):
+        if component == "main" or address in published:
+            suites[address].add(suite)
+    sure = [
+        address for address in suites if address in published or any("-updates" in each for each in suites[address])
+    ]
+    for address in reversed(sure + [each for each in suites if each not in sure]):
+        for usable in _usable(address):
+            for archive in published.get(address) or _guessed(usable, suites[address], names):
+                if archive:
                     yield archive, usable
 
 
-def _sources(apt: Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Address, suites and components of every enabled binary source, in apt's order."""
-    for path in [apt / "sources.list", *sorted((apt / "sources.list.d").glob("*"))]:
-        if not path.is_file():
-            continue
-        lines = [line.rstrip() for line in path.read_text().splitlines() if not line.lstrip().startswith("#")]
-        if path.suffix == ".list":
-            for line in lines:
-                if match := _ONE_LINE.match(line.partition("#")[0].strip()):
-                    yield match[1], [match[2]], match[3].split()
-        elif path.suffix == ".sources":
-            for fields in stanzas("\n".join(lines)):
-                entry = {key.lower(): value.split() for key, value in fields.items()}
-                if "deb" in entry.get("types", []) and entry.get("enabled", ["yes"])[0].lower() != "no":
-                    for address in entry.get("uris", []):
-                        yield address, entry.get("suites", []), entry.get("components", [])
+def _guessed(address: str, suites: Iterable[str], names: str) -> Iterator[str]:
+    """The archive that an address is of, which apt has fetched nothing from."""
+    pattern = re.compile(rf"(?:{names or '(?!)'})(?P<part>-updates|-security)?")
+    found = {match["part"] for suite in suites if (match := pattern.fullmatch(suite))}
+    if "-security" in found:
+        yield SECURITY
+    if "-updates" in found or (None in found and address.rstrip("/").endswith("/debian")):
+        yield DEBIAN
 
 
-def _usable(address: str, apt: Path) -> Iterable[str]:
+def _index_targets(apt: Path, fields: Iterable[str], *options: str) -> list[list[str]]:
+    """Address of every enabled source of binary packages, in apt's order, and these fields of it."""
+    form = "\t".join(f"$({each})" for each in ("REPO_URI", *fields))
+    argv = ["apt-get", "indextargets", f"-oDir::Etc={apt}", *options, "--format", form, "Created-By: Packages"]
+    environment = os.environ | {"LC_ALL": "C.UTF-8"}
+    try:
+        done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=True)
+    except FileNotFoundError:
+        return []
+    except subprocess.CalledProcessError as error:
+        raise UserError(f"{apt}: apt cannot read its sources:\n{error.stderr.strip()}") from None
+    return [line.split("\t") for line in done.stdout.splitlines()]
+
+
+def _usable(address: str) -> Iterable[str]:
     """The address itself, or what a list of mirrors on this computer names first (Debian's cloud images have one)."""
     if address.startswith(_MIRROR_LIST):
-        path = Path(address.removeprefix(_MIRROR_LIST).replace("///", "/"))
+        path = Path(address.removeprefix(_MIRROR_LIST).replace("///", "/").rstrip("/"))
         lines = path.read_text().split() if path.is_file() else []
         return [line for line in lines if line.startswith(_SCHEMES)][:1]
     return [address] if address.startswith(_SCHEMES) else []

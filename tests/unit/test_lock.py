@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 import re
 from collections.abc import Iterator
@@ -328,6 +329,65 @@ def test_list_of_mirrors(tmp_path: Path) -> None:
     (tmp_path / "mirrors.list").write_text("http://first/debian\nhttp://second/debian\n")
     (tmp_path / "sources.list").write_text(f"deb mirror+file://{tmp_path}/mirrors.list bookworm main\n")
     assert mirror.resolve({}, tmp_path, tmp_path / "os-release").archives == {DEBIAN: "http://first/debian"}
+
+
+def resolved(directory: Path, sources: str) -> dict[str, str]:
+    """The mirrors of a trixie with these sources."""
+    (directory / "os-release").write_text("ID=debian\nVERSION_CODENAME=trixie\n")
+    (directory / "sources.list").write_text(sources)
+    return dict(mirror.resolve({}, directory, directory / "os-release").archives)
+
+
+VENDORS = """\
+deb https://dl.browser.example/stable stable main
+deb https://apt.tool.example/ trixie main
+"""
+
+
+def test_source_of_a_vendor_is_no_mirror(tmp_path: Path) -> None:
+    """Whose suite is called `stable`, or as Debian's. Seen to be taken for Debian's mirror."""
+    assert resolved(tmp_path, VENDORS) == {}
+    assert resolved(tmp_path, VENDORS + ONE_LINE) == BOTH
+
+
+def test_source_of_a_vendor_at_an_address_like_debians(tmp_path: Path) -> None:
+    """The mirror has a suite of updates, too, which no vendor has. Seen to fail: the first was taken."""
+    vendor = "deb https://pkgs.vendor.example/stable/debian trixie main\n"
+    mirrors = [f"deb http://files.company.example/remote {suite} main\n" for suite in ("trixie", "trixie-updates")]
+    assert resolved(tmp_path, "".join([vendor, *mirrors])) == {DEBIAN: "http://files.company.example/remote"}
+
+
+def test_what_apt_has_fetched_says_who_publishes_a_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever addresses and suites are called. Seen to fail: the vendor's was taken, the company's was not."""
+    lists = tmp_path / "lists"
+    lists.mkdir()
+    (tmp_path / "apt.conf").write_text(f'Dir::State::lists "{lists}";')
+    monkeypatch.setenv("APT_CONFIG", str(tmp_path / "apt.conf"))
+
+    def fetched(place: str, suite: str, origin: str, label: str) -> None:
+        index = lists / f"{place}_dists_{suite}_main_binary-amd64_Packages"
+        index.write_text("")
+        release = f"Origin: {origin}\nLabel: {label}\nCodename: {suite}\nArchitectures: amd64\nComponents: main\n"
+        listing = f"SHA256:\n {hashlib.sha256(b'').hexdigest()} 0 main/binary-amd64/Packages\n"
+        (lists / f"{place}_dists_{suite}_Release").write_text(release + listing)
+
+    fetched("pkgs.vendor.example_debian", "trixie", "Vendor", "Debian")
+    fetched("files.company.example_one", "stock", "Debian", "Debian")
+    fetched("files.company.example_two", "fixes", "Debian", "Debian-Security")
+    sources = """\
+deb [arch=amd64] http://pkgs.vendor.example/debian trixie main
+deb [arch=amd64] http://files.company.example/one stock main
+deb [arch=amd64] http://files.company.example/two fixes main
+"""
+    assert resolved(tmp_path, sources) == {
+        DEBIAN: "http://files.company.example/one",
+        SECURITY: "http://files.company.example/two",
+    }
+
+
+def test_sources_that_apt_cannot_read(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"sources\.list"):
+        resolved(tmp_path, "nonsense\n")
 
 
 def test_mirror_variable_must_be_an_address() -> None:
