@@ -1,4 +1,5 @@
-"""Where Debian packages come from: the environment, else this computer's own apt configuration.
+"""Where Debian packages come from: the environment, else this computer's own apt configuration, else, on another
+distribution, what its package python-apt-common says of Debian.
 
 No file of the project names a mirror, so a lock never sends anyone to a server that somebody else chose.
 """
@@ -28,6 +29,10 @@ _SCHEMES = ("http://", "https://", "file:/")
 _MIRROR_LIST = "mirror+file:"
 _LABELS = {"Debian": DEBIAN, "Debian-Security": SECURITY}
 """Of the archives' Release files, whose origin is `Debian`."""
+_TEMPLATES = ("debian.info", "Debian.info")
+"""The file that describes Debian's archives to programs which edit apt's sources; the package's newer name first."""
+_TEMPLATE_SUITES = {"{series}": DEBIAN, "{series}-security": SECURITY}
+"""There, by suite; the archive of all releases since Debian 11."""
 _FIELD = re.compile(r"^([!-9;-~]+):[ \t]*(.*(?:\n[ \t].*)*)", re.MULTILINE)
 
 
@@ -52,6 +57,7 @@ def resolve(
     environment: Mapping[str, str] = os.environ,
     apt: Path = Path("/etc/apt"),
     os_release: Path = Path("/etc/os-release"),
+    templates: Path = Path("/usr/share/python-apt/templates"),
 ) -> Mirrors:
     """The mirrors to use. One that is missing is an error only when it is needed: see `Mirrors.of`."""
     given = {archive: environment[variable] for archive, variable in _VARIABLES.items() if environment.get(variable)}
@@ -59,7 +65,10 @@ def resolve(
         if not address.startswith(_SCHEMES):
             variable = _VARIABLES[archive]
             raise UserError(f"{variable}={address}: no address; write it like {variable}={_EXAMPLES[archive]}")
-    known = {} if given.keys() == set(ARCHIVES) else dict(_configured(apt, _suites(os_release)))
+    known: dict[str, str] = {}
+    if given.keys() != set(ARCHIVES):
+        names = _suites(os_release)
+        known = dict(() if names else _described(templates)) | dict(_configured(apt, names))
     snapshot = environment.get("SNAPSHOT") or None
     return Mirrors(
         {archive: address.rstrip("/") for archive, address in (known | given).items()},
@@ -76,9 +85,9 @@ def stanzas(text: str) -> Iterator[dict[str, str]]:
 
 def _advice(archive: str) -> str:
     return (
-        f"no mirror known for the Debian archive '{archive}', and this computer's apt configuration names none; "
-        f"set {_VARIABLES[archive]}, for example:\n"
-        f"  make lock {' '.join(f'{_VARIABLES[each]}={_EXAMPLES[each]}' for each in ARCHIVES)}\n"
+        f"no mirror known for the Debian archive '{archive}': neither this computer's apt configuration nor its "
+        f"package python-apt-common names one; give the same command {_VARIABLES[archive]}, for example:\n"
+        f"  make image ROBOT=3 {' '.join(f'{_VARIABLES[each]}={_EXAMPLES[each]}' for each in ARCHIVES)}\n"
         "where MIRROR is a Debian mirror near you. SNAPSHOT=http://SNAPSHOT/archive is where older versions come from."
     )
 
@@ -125,6 +134,15 @@ def _guessed(address: str, suites: Iterable[str], names: str) -> Iterator[str]:
         yield SECURITY
     if "-updates" in found or (None in found and address.rstrip("/").endswith("/debian")):
         yield DEBIAN
+
+
+def _described(templates: Path) -> Iterator[tuple[str, str]]:
+    """Archive and address of Debian's own archives, on a distribution whose apt has sources of its own."""
+    for file in (templates / name for name in _TEMPLATES):
+        for fields in stanzas(file.read_text()) if file.is_file() else ():
+            archive, address = _TEMPLATE_SUITES.get(fields.get("Suite", "")), fields.get("BaseURI", "")
+            if archive and address.startswith(_SCHEMES):
+                yield archive, address
 
 
 def _index_targets(apt: Path, fields: Iterable[str], *options: str) -> list[list[str]]:

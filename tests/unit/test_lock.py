@@ -279,6 +279,41 @@ deb http://second/debian trixie main
 deb http://first/security trixie-security main
 """
 BOTH = {DEBIAN: "http://first/debian", SECURITY: "http://first/security"}
+TEMPLATE = """\
+ChangelogURI: http://changelogs/%s
+
+Suite: {{series}}
+RepositoryType: deb
+BaseURI: http://first/debian/
+MatchURI: ((http|https)[0-9]*\\.([a-z]*\\.){{{{0,1}}}}|deb\\.)first
+MirrorsFile: debian.mirrors
+Component: main
+CompDescription: Officially supported
+X-Version: ge 12
+
+Suite: {{series}}
+RepositoryType: deb
+BaseURI: http://first/debian/
+Component: main
+X-Version: le 11
+
+Suite: {{series}}-security
+BaseURI: http://first/security/
+ParentSuite: {{series}}
+X-Version: ge 11
+
+Suite: {{series}}/updates
+BaseURI: http://old/security/
+X-Version: le 10
+
+Suite: {{series}}-updates
+ParentSuite: {{series}}
+
+Suite: sid
+BaseURI: http://unstable/debian/
+Component: main
+""".format()
+"""As python-apt-common has it in its versions 2.6 to 3.0, with other addresses."""
 
 
 @pytest.mark.parametrize(
@@ -310,11 +345,31 @@ def test_mirrors(
     (tmp_path / "os-release").write_text(f"NAME=x\nVERSION_CODENAME=trixie\nID={os_id}\n")
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    found = mirror.resolve(environment, tmp_path, tmp_path / "os-release")
+    found = mirror.resolve(environment, tmp_path, tmp_path / "os-release", tmp_path / "templates")
     assert found.archives == expected
     for archive in set(mirror.ARCHIVES) - set(expected):
-        with pytest.raises(UserError, match=r"SECURITY_MIRROR=http://MIRROR/debian-security"):
+        with pytest.raises(UserError, match=r"make image .*SECURITY_MIRROR=http://MIRROR/debian-security"):
             found.of(archive)
+
+
+@pytest.mark.parametrize("name", ["Debian.info", "debian.info"])
+@pytest.mark.parametrize(
+    ("os_id", "environment", "expected"),
+    [
+        ("ubuntu", {}, BOTH),
+        ("ubuntu", {"MIRROR": "http://mine/debian"}, BOTH | {DEBIAN: "http://mine/debian"}),
+        ("linuxmint", {}, BOTH),
+        ("debian", {}, {}),  # its apt knows better: a mirror near by, or none for a reason
+    ],
+)
+def test_another_distribution_says_where_debian_is(
+    tmp_path: Path, name: str, os_id: str, environment: dict[str, str], expected: dict[str, str]
+) -> None:
+    """Seen to fail: on Ubuntu no mirror was known, and the remedy named was `make lock`, which replaces the locks."""
+    (tmp_path / "os-release").write_text(f"ID={os_id}\nVERSION_CODENAME=trixie\nID_LIKE=debian\n")
+    (tmp_path / "sources.list").write_text("deb http://first/ubuntu noble main\n")
+    (tmp_path / name).write_text(TEMPLATE)
+    assert mirror.resolve(environment, tmp_path, tmp_path / "os-release", tmp_path).archives == expected
 
 
 def test_a_release_is_known_by_this_computer_alone(tmp_path: Path) -> None:
