@@ -6,6 +6,8 @@ in_path = $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(wo
 $(foreach name,BUILD KEYS APPS,$(if $(strip $(call in_path,$(name))),$(error $(name)=$(value $(name)): is a path with blanks \
     or with a character that means something to a shell; take another directory)))
 export BUILD
+# Names of files are UTF-8 in any user's locale: the virtual environment has the path of the checkout in its files.
+export LC_ALL := C.UTF-8
 VENV := $(BUILD)/venv
 PYTHON := $(VENV)/bin/python
 FLOTILLA := $(PYTHON) -m flotilla
@@ -354,6 +356,7 @@ new_venv = python3 -m venv $(VENV); sed -n '/^uv==/,/[^\\]$$/p' requirements.loc
     $(uv_install) --no-deps --no-build-isolation -r requirements-source.lock
 uv_install = $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes
 $(VENV)/.complete: requirements.lock requirements-source.lock images/host-packages.txt
+	$(Q)images/check-host
 	$(Q)images/install-host-packages images/host-packages.txt
 	@# The last good one comes back where the new one fails. It cannot be made beside: its programs name its place.
 	$(Q)set -e; test ! -e $@ || { rm -rf $(VENV).before; mv $(VENV) $(VENV).before; }; \
@@ -369,12 +372,13 @@ help: ## this list
 	    /^##= / {print "  " substr($$0, 5)}' $(MAKEFILE_LIST)
 
 ##@ Variables of all targets
-##= MIRROR=           Debian mirror; by default the one of this computer's apt, if it is a Debian
+##= MIRROR=           Debian mirror; by default the one of this computer's apt, on other systems Debian's own
 ##= SECURITY_MIRROR=  the same for security updates
 ##= SNAPSHOT=         snapshot archive for locked packages that left the mirror
 ##= BUILD=            where outputs go instead of build/
 ##= KEYS=             where keys are instead of ansible/keys/
 ##= APPS=             where apps are instead of apps/
+##= ANY_HOST=1        set up a computer that is none of the supported hosts
 ##= V=1               show the commands
 
 # What somebody gave reaches a program as it stands, as one word or as several: no shell reads it as a command.

@@ -68,7 +68,7 @@ def unknown_targets(text: str) -> set[str]:
 @functools.cache
 def sources() -> str:
     """All that programs may say, in one text."""
-    kinds = (".py", ".c", ".h", ".sh", ".yml", ".j2", "init", "preinit", "grub.cfg.j2")
+    kinds = (".py", ".c", ".h", ".sh", ".yml", ".j2", "init", "preinit", "grub.cfg.j2", "check-host")
     files = [file for file in tracked() if file.endswith(kinds) and not file.startswith(("docs/", "tests/"))]
     return "\n".join((paths.PROJECT / file).read_text() for file in files if (paths.PROJECT / file).is_file())
 

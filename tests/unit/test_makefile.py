@@ -148,3 +148,13 @@ def test_an_environment_that_cannot_be_made_leaves_the_last_one(tmp_path: Path, 
     assert done.returncode != 0
     assert sorted(path.name for path in last.iterdir()) == [".complete", "marker"], done.stderr
     assert not last.with_name("venv.before").exists()
+
+
+def test_commands_run_in_utf_8_whatever_the_users_locale_is() -> None:
+    """Seen to fail: with the path `/home/u/Müller` and a locale of ISO 8859-1, pip's first line had the path's bytes
+    encoded twice, and `make setup` ended with `build/venv/bin/pip: not found`."""
+    argv = ["make", "--eval=shown: ; @locale charmap", "shown"]
+    done = subprocess.run(
+        argv, cwd=paths.PROJECT, env=os.environ | {"LC_ALL": "C"}, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "UTF-8\n"
