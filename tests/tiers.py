@@ -12,7 +12,7 @@ import pytest
 from xdist.scheduler import LoadScopeScheduling
 
 TIERS = {"unit": "unit", "runtime": "runtime", "image": "image"} | dict.fromkeys(
-    ("boot", "provisioning", "end_to_end"), "boot"
+    ("boot", "provisioning", "end_to_end", "hosts"), "boot"
 )
 """By folder. What is marked `nightly` is of that tier only."""
 LONGEST = (
