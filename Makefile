@@ -15,6 +15,8 @@ FLOTILLA := $(PYTHON) -m flotilla
 step = $(PYTHON) -m flotilla.common.progress
 Q := $(if $(filter-out 0,$(V)),,@)
 export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS
+# Python's programs read and write files in UTF-8, whatever the user's locale.
+export PYTHONUTF8 := 1
 MAKEFLAGS += --no-print-directory
 .DEFAULT_GOAL := help
 
