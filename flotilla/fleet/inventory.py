@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from flotilla.common import cache, durable, paths
+from flotilla.common import ansible, cache, durable, paths
 from flotilla.common.errors import Problem, ProblemsError, UserError
 from flotilla.common.yaml_file import SYNTAX, Entry, Loc, child, compose, did_you_mean, dotted, explained, pairs
 from flotilla.fleet import apps, messages, privileges
@@ -109,7 +109,7 @@ def _merged(directory: Path) -> dict[str, Any]:
     contents = [part for file in files for part in (str(file.relative_to(directory)), file.read_bytes())]
     kept = paths.CACHE / f"inventory-{cache.digest(version('ansible-core'), *contents)}.json"
     try:
-        merged: dict[str, Any] = json.loads(kept.read_text())
+        merged: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):  # or cut short by a power cut
         text = _ansible_inventory(directory)
         kept.parent.mkdir(parents=True, exist_ok=True)
@@ -125,16 +125,15 @@ def _ansible_inventory(directory: Path) -> str:
     home.mkdir(parents=True, exist_ok=True)
     empty = home / "empty.cfg"
     empty.touch()
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("ANSIBLE_")} | {
+    environment = ansible.environment() | {
         "ANSIBLE_CONFIG": str(empty),
         "ANSIBLE_HOME": str(home),
         "ANSIBLE_INVENTORY_ANY_UNPARSED_IS_FAILED": "1",
-        "LC_ALL": "C.UTF-8",
     }
     argv = [str(program), "-i", str(directory), "--list"]
     try:
         done = subprocess.run(
-            argv, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+            argv, env=environment, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False
         )
     except FileNotFoundError:
         raise UserError(f"{program}: not installed; run `make setup`") from None

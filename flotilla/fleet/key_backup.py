@@ -46,7 +46,7 @@ def backup(to: Path, password: Path | None) -> int:
     try:
         _vault("encrypt", password, content.getvalue(), beside)
         beside.chmod(0o600)
-        beside.replace(to)
+        durable.rename(beside, to)
     finally:
         beside.unlink(missing_ok=True)
     return len(files)

@@ -7,8 +7,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flotilla.common import paths, progress
+from flotilla.common import ansible, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
 
 ANSIBLE = paths.PROJECT / "ansible"
 
@@ -24,10 +25,17 @@ def play(playbook: str, *, robot: int | None, guests: bool, words: Sequence[str]
     programs = Path(sys.executable).parent
     argv = [str(programs / "ansible-playbook"), "-i", "inventory"]
     argv += ["-i", str(paths.GUESTS)] if guests else []
-    if limit := f"robot{robot}" if robot is not None else "guests" if guests else "":
-        argv += ["-l", limit]
+    if robot is not None:
+        argv += ["-l", inventory.robot(inventory.load_fleet(), robot).name]
+    elif guests:
+        argv += ["-l", "guests"]
     argv += [*words, file.name]
     progress.command(argv)
     os.chdir(ANSIBLE)
-    os.environ |= {"PATH": f"{programs}:{os.environ['PATH']}", "BUILD": str(paths.BUILD), "KEYS": str(paths.KEYS)}
-    os.execv(argv[0], argv)
+    environment = ansible.environment() | {
+        "PATH": f"{programs}:{os.environ['PATH']}",
+        "BUILD": str(paths.BUILD),
+        "KEYS": str(paths.KEYS),
+        "APPS": str(paths.APPS),
+    }
+    os.execve(argv[0], argv, environment)

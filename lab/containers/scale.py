@@ -26,7 +26,7 @@ from typing import Any
 
 import yaml
 
-from flotilla.common import cache, paths, progress
+from flotilla.common import ansible, cache, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
@@ -120,7 +120,7 @@ def play(inventories: Sequence[Path], *more: str) -> Play:
     report = paths.BUILD / "reports/fleet.json"
     report.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory(prefix="ansible-") as home:
-        environment = os.environ | {
+        environment = ansible.environment() | {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
             "ANSIBLE_HOME": home,
             "ANSIBLE_NOCOLOR": "1",

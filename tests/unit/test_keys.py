@@ -132,16 +132,16 @@ def test_an_interrupted_rotation_leaves_a_key_that_robots_admit(
 ) -> None:
     """Before either of the two renames."""
     before = keys.operator().read_bytes()
-    rename, calls = Path.rename, []
+    replace, calls = Path.replace, []
 
     def interrupted(file: Path, target: Path) -> Path:
         calls.append(file)
         if len(calls) == interrupted_at:
             raise KeyboardInterrupt
-        return rename(file, target)
+        return replace(file, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", interrupted)
+        patch.setattr(Path, "replace", interrupted)
         with pytest.raises(KeyboardInterrupt):
             keys.rotate_operator_key()
     now = keys.operator()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
@@ -11,7 +14,7 @@ import yaml
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.identity import render
-from flotilla.robot import provision
+from flotilla.robot import playbook, provision
 
 ROLES = paths.PROJECT / "ansible" / "roles"
 
@@ -69,3 +72,40 @@ def test_the_playbook_rotates_keys_by_a_command_that_there_is() -> None:
         whole = [sys.executable, *argv[1:], *words, "--help"]
         done = subprocess.run(whole, cwd=paths.PROJECT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], dict[str, str]]]:
+    """Words and environment of what would run instead of Ansible."""
+    runs: list[tuple[list[str], dict[str, str]]] = []
+    monkeypatch.setattr(os, "chdir", lambda _: None)
+    monkeypatch.setattr(os, "execve", lambda _, argv, environment: runs.append((argv, environment)))
+    return runs
+
+
+def test_a_robot_has_the_name_that_the_inventory_gives_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[tuple[list[str], dict[str, str]]]
+) -> None:
+    """Seen to fail: robot 3 was taken for `robot3`, and Ansible found no such host."""
+    shutil.copytree(paths.INVENTORY, tmp_path / "inventory")
+    robots = tmp_path / "inventory" / "robots.yml"
+    robots.write_text(robots.read_text().replace("robot3:", "alpha:"))
+    monkeypatch.setattr(paths, "INVENTORY", tmp_path / "inventory")
+    playbook.play("fleet", robot=3, guests=False, words=["--check"])
+    ((argv, _),) = played
+    assert argv[1:] == ["-i", "inventory", "-l", "alpha", "--check", "fleet.yml"]
+    with pytest.raises(UserError, match=r"robot 9: no such robot in .*; robots are 1, 2, 3, 4"):
+        playbook.play("fleet", robot=9, guests=False, words=[])
+
+
+def test_a_playbook_has_the_configuration_of_this_project(
+    monkeypatch: pytest.MonkeyPatch, played: list[tuple[list[str], dict[str, str]]]
+) -> None:
+    """Seen to fail: the user's variables changed how robots were reached."""
+    for name, value in (("ANSIBLE_CONFIG", "/elsewhere.cfg"), ("ANSIBLE_FORKS", "1"), ("LC_ALL", "de_DE.ISO-8859-1")):
+        monkeypatch.setenv(name, value)
+    playbook.play("fleet", robot=None, guests=False, words=[])
+    ((_, environment),) = played
+    configured = {name: value for name, value in environment.items() if name.startswith(("ANSIBLE_", "LC_"))}
+    assert configured == {"ANSIBLE_CONFIG": str(paths.PROJECT / "ansible/ansible.cfg"), "LC_ALL": "C.UTF-8"}
+    assert environment["HOME"] == os.environ["HOME"]
