@@ -122,7 +122,7 @@ check-fleet: | setup ## validate the fleet's description
 	$(Q)$(FLOTILLA) check-fleet
 
 requirements: | setup ## lock the Python environment anew from requirements.in
-	$(Q)$(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	$(Q)$(by_pip_settings) $(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	    --no-header --no-annotate --quiet requirements.in -o requirements.lock
 
 ##@ Keys
@@ -353,10 +353,11 @@ setup-tests: setup ## install what testing needs
 
 # pip brings uv alone: that installs all others in a quarter of pip's time.
 new_venv = python3 -m venv $(VENV); sed -n '/^uv==/,/[^\\]$$/p' requirements.lock >$(VENV)/uv.lock; \
-    $(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r $(VENV)/uv.lock; \
+    $(by_pip_settings) $(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r $(VENV)/uv.lock; \
     $(uv_install) --only-binary :all: -r requirements.lock; \
     $(uv_install) --no-deps --no-build-isolation -r requirements-source.lock
-uv_install = $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes
+by_pip_settings = $(PYTHON) images/pip_settings.py
+uv_install = $(by_pip_settings) $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes
 $(VENV)/.complete: requirements.lock requirements-source.lock images/host-packages.txt
 	$(Q)images/check-host
 	$(Q)images/install-host-packages images/host-packages.txt

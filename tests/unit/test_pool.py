@@ -6,7 +6,6 @@ import errno
 import hashlib
 import os
 import re
-import ssl
 import subprocess
 import sys
 import threading
@@ -22,7 +21,7 @@ from flotilla.common.errors import UserError
 from images.builder import download, mirror, pool
 from images.builder.lock import Lock, Package, Suite
 from images.builder.mirror import DEBIAN, SECURITY, Mirrors
-from tests.unit.fault_server import PAGE, Answer, FaultServer
+from tests.unit.fault_server import PAGE, Answer, FaultServer, certificate
 
 RELEASED = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 SUITES = (Suite(DEBIAN, "bookworm", RELEASED), Suite(SECURITY, "bookworm-security", RELEASED.replace(day=4)))
@@ -389,15 +388,7 @@ def test_settings_of_apt_that_apt_cannot_read(server: FaultServer, apt_settings:
 @pytest.fixture
 def inspected(tmp_path: Path) -> Iterator[FaultServer]:
     """A mirror whose certificate is of an authority of its own, as it appears behind a proxy that inspects TLS."""
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2",
-         "-subj", "/CN=proxy", "-addext", "subjectAltName=IP:127.0.0.1",
-         "-keyout", tmp_path / "key.pem", "-out", tmp_path / "ca.pem"],
-        check=True, capture_output=True,
-    )  # fmt: skip
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(tmp_path / "ca.pem", tmp_path / "key.pem")
-    running = FaultServer(context)
+    running = FaultServer(certificate(tmp_path))
     serve(running)
     yield running
     running.close()
@@ -572,6 +563,15 @@ def test_repository_on_another_disk_copies(real: Lock, tmp_path: Path, monkeypat
     pool.repository(real, tmp_path / "repository")
     for each in real.packages:
         assert (tmp_path / "repository" / each.path).read_bytes() == pool.file(each).read_bytes()
+
+
+def test_damaged_description(real: Lock) -> None:
+    """Seen to ask for the file to be deleted by hand."""
+    (tool,) = [each for each in real.packages if each.name == "tool"]
+    damage(tool, b"x" * tool.size)
+    with pytest.raises(UserError, match=r"package tool .*run again"):
+        pool.control(tool)
+    assert not pool.file(tool).exists()
 
 
 def test_pool_file_that_is_no_package(tmp_path: Path) -> None:
