@@ -15,6 +15,7 @@ import gzip
 import json
 import lzma
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,13 +30,12 @@ from debian.debian_support import NativeVersion
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
-from images.builder import build, kernel, manifest, mirror, pool
+from images.builder import build, download, kernel, manifest, mirror, pool
 from images.builder.lock import Lock, Package, board_lock, lock_file, read_lock
 
 OLD_DAYS = 30
 """Age of a lock above which nobody has looked for updates for too long."""
 _ADDRESS = "https://security-tracker.debian.org/tracker/data/json"
-_TIMEOUT_S = 60.0
 _SCHEMES = ("http://", "https://", "file:/")
 _UNIMPORTANT = "unimportant"
 _BUILT_USING = re.compile(r"(\S+) \(= (\S+)\)")
@@ -169,22 +169,20 @@ def read_tracker(tracker: str | None) -> dict[str, Any]:
         try:
             data = json.loads(_unpacked(content))
         except (ValueError, OSError, EOFError, lzma.LZMAError) as error:
-            raise UserError(f"TRACKER={tracker}: is not JSON ({error}); get it anew from {_ADDRESS}") from None
+            remedy = download.PAGE.remedy if content.lstrip().startswith(b"<") else f"get it anew from {_ADDRESS}"
+            raise UserError(f"TRACKER={tracker}: is not JSON ({error}); {remedy}") from None
     if not isinstance(data, dict) or not all(isinstance(issues, dict) for issues in data.values()):
         raise UserError(f"TRACKER={tracker}: is JSON, but not the tracker's; get it from {_ADDRESS}")
     return data
 
 
 def _download(address: str) -> bytes:
-    import http.client
-    import urllib.request
-
-    try:
-        with urllib.request.urlopen(address, timeout=_TIMEOUT_S) as answer:
-            content: bytes = answer.read()
-    except (OSError, ValueError, http.client.HTTPException) as error:
-        raise UserError(f"TRACKER={address}: {error}; try again, or give a file: TRACKER=FILE") from None
-    return content
+    wanted = download.File("tracker", (address,))
+    with tempfile.TemporaryDirectory() as directory:
+        for failure in download.fetch([wanted], Path(directory)).values():
+            remedies = "; ".join(each for each in (failure.kind.remedy, "or give a file: TRACKER=FILE") if each)
+            raise UserError(f"TRACKER={address}: {failure.reason}; {remedies}")
+        return Path(directory, wanted.name).read_bytes()
 
 
 def _read(path: Path) -> bytes:

@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import subprocess
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -400,7 +401,7 @@ def resolve(name: str, recipe: Recipe, mirrors: Mirrors, without: Collection[str
 
 class Apt:
     """apt as resolver and verifier, in a directory of its own: no root, and nothing of this computer's configuration
-    but its proxy."""
+    but what it needs to reach the network."""
 
     def __init__(self, architecture: str, mirrors: Mirrors, suites: Sequence[tuple[str, str]]) -> None:
         self.architecture = architecture
@@ -442,7 +443,9 @@ class Apt:
             "Acquire::Languages": "none",
             "Acquire::ForceHash": "sha256",
             "Acquire::Retries": "3",
-        } | _proxies()
+            "Acquire::http::Timeout": "15",
+            "Acquire::https::Timeout": "15",
+        } | _network()
         (self.directory / "apt.conf").write_text("".join(f'{key} "{value}";\n' for key, value in settings.items()))
 
     def _run(self, *arguments: str) -> str:
@@ -514,10 +517,22 @@ def _address(line: str) -> str:
     return unquote(line.split("'")[1])
 
 
-def _proxies() -> dict[str, str]:
-    """This computer's proxies for apt."""
+def _network() -> dict[str, str]:
+    """This computer's settings of apt for the network: proxies, certificates, where its passwords are."""
     dump = subprocess.run(
         ["apt-config", "dump", "--format", "%f %v%n", "Acquire"], capture_output=True, text=True, check=True
     ).stdout
     pairs = (line.partition(" ") for line in dump.splitlines())
-    return {key: json.loads(f'"{value}"') for key, _, value in pairs if "::proxy" in key.lower() and value}
+    found = {
+        key: json.loads(f'"{value}"')
+        for key, _, value in pairs
+        if re.match(r"Acquire::https?::", key) and not key.endswith("::") and value
+    }
+    places = ["shell", "Dir::Etc::netrc", "Dir::Etc::netrc/f", "Dir::Etc::netrcparts", "Dir::Etc::netrcparts/d"]
+    shell = subprocess.run(["apt-config", *places], capture_output=True, text=True, check=True).stdout
+    for line in shell.splitlines():
+        key, _, value = line.partition("=")
+        found[key] = shlex.split(value)[0]
+    if certificates := os.environ.get("SSL_CERT_FILE"):
+        found.setdefault("Acquire::https::CAInfo", certificates)
+    return found

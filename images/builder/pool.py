@@ -202,12 +202,15 @@ def _remedy_of_gone(mirrors: Mirrors) -> str:
 
 
 def control(package: Package) -> str:
-    """The package's own description of itself. UserError where the pool's file is damaged."""
+    """The package's own description of itself. UserError where the pool's file is damaged, which is then removed."""
     try:
         return deb.control(file(package))
     except ValueError as error:
+        if not _damaged([package]):
+            raise UserError(f"package {package}: {error}; it is as the lock says: run `make lock`") from error
+        file(package).unlink()
         raise UserError(
-            f"package {package}: {error}; {paths.shown(file(package))} is no package: `make lock`"
+            f"package {package}: {error}; {paths.shown(file(package))} was damaged and is removed: run again"
         ) from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import hashlib
 import os
@@ -19,6 +20,7 @@ from images.builder import lock, mirror
 from images.builder.lock import Lock, Package, Suite
 from images.builder.mirror import DEBIAN, SECURITY
 from tests.unit.debian_archive import RELEASED, Archive, signing_keys, stanza
+from tests.unit.fault_server import FaultServer, certificate
 
 LIBC = Package(
     "libc6", "2.36-9+deb12u1", "i386", "required", DEBIAN, 7, "0" * 64, "pool/main/g/glibc/libc6_2.36_i386.deb"
@@ -253,6 +255,33 @@ def test_missing_keyring_names_the_package(project: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(lock, "_KEYRINGS", (project / "none.gpg",))
     with pytest.raises(UserError, match="debian-archive-keyring"):
         lock.update_locks(BOARD, Archive(project / "archive").write())
+
+
+def test_certificates_and_passwords_of_this_computers_apt(
+    signed: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind a proxy that inspects TLS. Seen to fail: of apt's settings, proxies alone were taken over."""
+    monkeypatch.delenv("SSL_CERT_FILE", raising=False)
+    server = FaultServer(certificate(tmp_path))
+    (tmp_path / "auth").write_text(f"machine {server.base} login user password secret\n")
+    (tmp_path / "apt.conf").write_text(
+        f'Acquire::https::CAInfo "{tmp_path}/ca.pem";\nDir::Etc::netrc "{tmp_path}/auth";\n'
+    )
+    monkeypatch.setenv("APT_CONFIG", str(tmp_path / "apt.conf"))
+    signed.write()
+    server.files = {f"/{path.relative_to(signed.directory)}": path.read_bytes() for path in files(signed.directory)}
+    try:
+        lock.update_locks(BOARD, server.mirrors)
+    finally:
+        server.close()
+    assert lock.read_lock("x86_64").packages
+    assert {each.get("Authorization") for each in server.headers} == {
+        f"Basic {base64.b64encode(b'user:secret').decode()}"
+    }
+
+
+def files(directory: Path) -> list[Path]:
+    return [path for path in directory.rglob("*") if path.is_file()]
 
 
 # --- mirrors ---
