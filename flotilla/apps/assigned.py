@@ -64,6 +64,7 @@ def _built(name: str, board: Board) -> BuiltApp:
     from images.builder import runtime
 
     subject = app.load(paths.APPS / name)
+    apps.check_names(subject.directory)
     # Rather too much, all of this package and of the builder, than too little.
     key = cache.digest(
         runtime.key(board.system), str(board.system), subject.directory, Path(__file__).parent,

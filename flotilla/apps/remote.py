@@ -128,6 +128,7 @@ def connection(robot: Robot, words: Sequence[str] | None = None) -> Iterator[Con
 
 def send(to: Connection, subject: app.App, board: Board, files: Path) -> None:
     """Put the built app `files` in the place of what the robot has of it, and end that."""
+    apps.check_names(files)
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         tar.add(files, arcname=".", filter=_plain)

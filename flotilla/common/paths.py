@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -44,3 +45,15 @@ def shown(path: Path) -> str:
         return str(path.relative_to(PROJECT))
     except ValueError:
         return str(path)
+
+
+_CATEGORIES = {"Cc": "a control character", "Cs": "a byte that is no UTF-8", "Zl": "a line end", "Zp": "a line end"}
+"""Unicode's general categories (UAX #44) of what no file's name on a robot may have."""
+
+
+def name_fault(name: str, most: int = 255) -> str:
+    """Why no file on a robot may have the name, empty where one may: names are lines of listings, in UTF-8."""
+    if found := next((kind for each in name if (kind := _CATEGORIES.get(unicodedata.category(each)))), ""):
+        return f"has {found} in its name; rename it"
+    size = len(name.encode())
+    return f"has a name of {size} bytes, more than {most}; give it a shorter one" if size > most else ""

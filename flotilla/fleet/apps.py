@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 import yaml
 
 from flotilla.common import cache, paths
+from flotilla.common.errors import UserError
 
 FILE = "app.yml"
 """An app's description in its directory."""
@@ -83,6 +84,7 @@ class BuiltApp:
 
 def read(name: str, directory: Path, program: str = "") -> BuiltApp:
     """The app that a build has put into `directory`. Modes are the two that are sent to robots."""
+    check_names(directory)
     found = sorted(directory.rglob("*"))
     inside = {path: PurePosixPath(path.relative_to(directory)) for path in found}
     files = {
@@ -92,6 +94,13 @@ def read(name: str, directory: Path, program: str = "") -> BuiltApp:
     }
     directories = tuple(inside[path] for path in found if path.is_dir())
     return BuiltApp(name, version(directory), files, directories, program)
+
+
+def check_names(directory: Path) -> None:
+    """UserError with the files of an app whose names no robot can have."""
+    faults = [(path, fault) for path in sorted(directory.rglob("*")) if (fault := paths.name_fault(path.name))]
+    if faults:
+        raise UserError("\n".join(f"{str(path.relative_to(directory))!a}: {fault}" for path, fault in faults))
 
 
 def version(directory: Path) -> str:

@@ -9,7 +9,7 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import identity
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Fleet, Robot
-from images.builder import card
+from images.builder import card, filesystem
 from images.builder.filesystem import Node
 
 _DATA = PurePosixPath("/data")
@@ -34,13 +34,7 @@ def nodes(fleet: Fleet, robot: Robot, apps: Sequence[BuiltApp] = ()) -> list[Nod
     tops = ["A", "A/etc", "var", "home", ".work", ".work/A", ".work/var", ".work/home"]
     directories = {_TOP / top for top in tops}
     made = [Node(_within(path), content, mode) for path, (content, mode) in files.items()]
-    size = sum(app.bytes for app in apps)
-    if size > card.DATA.size * _MOST:
-        raise UserError(
-            f"{robot.name}: its apps {', '.join(robot.apps)} have {size / card.MIB:.1f} MiB, more than {_MOST:.0%} of "
-            f"the data partition as it is flashed, {card.DATA.size // card.MIB} MiB; enlarge data_mib in "
-            "images/boot/card.yml"
-        )
+    _check_size(robot, apps)
     for app in apps:
         place = _within(app.place)
         directories |= {place, *(place / directory for directory in app.directories)}
@@ -50,6 +44,20 @@ def nodes(fleet: Fleet, robot: Robot, apps: Sequence[BuiltApp] = ()) -> list[Nod
     directories |= {parent for directory in directories for parent in directory.parents if parent != _TOP}
     made += [Node(path) for path in directories]
     return sorted(made, key=lambda node: node.path.parts)
+
+
+def _check_size(robot: Robot, apps: Sequence[BuiltApp]) -> None:
+    """UserError where the robot's apps leave too little room."""
+    sizes = {app.place / path: len(content) for app in apps for path, (content, _) in app.files.items()}
+    size = sum(map(filesystem.taken, sizes.values())) + sum(filesystem.taken(0) * len(app.directories) for app in apps)
+    if size > card.DATA.size * _MOST:
+        largest = max(sizes, key=sizes.__getitem__)
+        raise UserError(
+            f"{robot.name}: its apps {', '.join(robot.apps)} take {size / card.MIB:.1f} MiB in {len(sizes)} files, "
+            f"more than {_MOST:.0%} of the data partition as it is flashed, {card.DATA.size // card.MIB} MiB; the "
+            f"largest file is {largest}, {sizes[largest] / card.MIB:.1f} MiB: give the robot less, or enlarge data_mib "
+            "in images/boot/card.yml"
+        )
 
 
 def _within(path: PurePosixPath) -> PurePosixPath:

@@ -9,6 +9,7 @@ import base64
 import importlib.util
 import io
 import json
+import os
 import subprocess
 import sys
 import tarfile
@@ -109,6 +110,36 @@ def test_apps_that_leave_no_room_are_refused(fleet: Fleet, hover: BuiltApp) -> N
     big = replace(hover, files={PurePosixPath("data"): (bytes(card.DATA.size // 2), 0o644)})
     with pytest.raises(UserError, match=r"robot4.*hover.*MiB.*data_mib in images/boot/card.yml"):
         data_partition.nodes(fleet, fleet.robots[4], [big])
+
+
+def test_small_files_count_by_what_they_take(fleet: Fleet, hover: BuiltApp) -> None:
+    """Seen to fail: five thousand bytes in as many files counted as 5 kB, and the card had inodes for some of them."""
+    files = {PurePosixPath(f"data/{number}"): (b"x", 0o644) for number in range(5000)}
+    many = replace(hover, files={**files, PurePosixPath("large"): (bytes(3 << 20), 0o644)})
+    with pytest.raises(UserError, match=r"take \d+\.\d MiB in 5001 files, .*the largest file is .*/large, 3\.0 MiB"):
+        data_partition.nodes(fleet, fleet.robots[4], [many])
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (b"two\nlines", r"'two\\nlines': has a control character in its name; rename it"),
+        (b"caf\xe9", r"'caf\\udce9': has a byte that is no UTF-8 in its name; rename it"),
+        ("line\u2028end".encode(), r"'line\\u2028end': has a line end in its name; rename it"),
+    ],
+)
+def test_an_apps_file_whose_name_no_robot_can_have_is_named(
+    fleet: Fleet, built: Path, monkeypatch: pytest.MonkeyPatch, name: bytes, said: str
+) -> None:
+    """In the built app, and before that in its sources. Seen to fail with a UnicodeEncodeError, and with a listing
+    whose lines were no files."""
+    (Path(os.fsdecode(os.fsencode(built) + b"/" + name))).write_bytes(b"")
+    with pytest.raises(UserError, match=f"^{said}$"):
+        apps.read("hover", built)
+    monkeypatch.setattr(paths, "APPS", built.parent)
+    (built / "app.yml").write_text("kind: block\n")
+    with pytest.raises(UserError, match=f"robot4.apps: hover: {said}$"):
+        assigned.built(fleet, [fleet.robots[4]])
 
 
 BILLS = {
