@@ -1,10 +1,12 @@
 # Front door. `make help` lists the targets; V=1 shows the commands.
 BUILD ?= build
-# Paths that stand in commands as they are.
-not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$
-in_path = $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1))
-$(foreach name,BUILD KEYS APPS,$(if $(strip $(call in_path,$(name))),$(error $(name)=$(value $(name)): is a path with blanks \
-    or with a character that means something to a shell; take another directory)))
+# Paths that stand in commands as they are; flotilla/common/paths.py has the same characters.
+not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$ : % = \#
+in_path = $(strip $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1)))
+unfit = a path with blanks or with a character that means something to a shell;
+$(if $(call in_path,CURDIR),$(error $(CURDIR): this checkout lies on $(unfit) move it))
+$(foreach name,BUILD KEYS APPS,$(if $(call in_path,$(name)),$(error $(name)=$(value $(name)): is $(unfit) \
+    take another directory)))
 export BUILD
 # Names of files are UTF-8 in any user's locale: the virtual environment has the path of the checkout in its files.
 export LC_ALL := C.UTF-8

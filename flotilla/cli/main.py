@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 from itertools import groupby
 
 from flotilla.cli.command import Command
+from flotilla.common import paths
 from flotilla.common.errors import UserError
 
 GROUP = "flotilla.commands"
@@ -60,6 +61,7 @@ def main() -> int:
     word = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
     arguments = parser(known, lambda command: word in (command.name, "completion")).parse_args()
     try:
+        paths.check()
         next(command for command in known if command.name == arguments.command).run(arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)

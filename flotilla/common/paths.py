@@ -6,6 +6,8 @@ import os
 import unicodedata
 from pathlib import Path
 
+from flotilla.common.errors import UserError
+
 PROJECT = Path(__file__).resolve().parents[2]
 BUILD = Path(os.environ.get("BUILD") or PROJECT / "build").resolve()
 """All outputs. Removing it loses nothing that cannot be made again."""
@@ -37,6 +39,31 @@ PACKAGES = PROJECT / "images" / "packages"
 LOCKS = PROJECT / "images" / "locks"
 KERNELS = PROJECT / "kernel"
 """Kernels of our own: a file each, and `fragments/` that they are made of."""
+
+
+UNFIT = " \t\n;&|<>()'\"`\\*?[]{}!$:%=#"
+"""Characters that none of these paths may have, the same as in the Makefile: shells, make, lists of directories and
+SSH's options read something else in them, and not all of these have a way to quote them."""
+
+
+def check() -> None:
+    """Refuse places where some program of a build or of a playbook would take another path than the one meant."""
+    given = {"": PROJECT, "BUILD=": BUILD, "KEYS=": KEYS, "APPS=": APPS}
+    unfit = {name: path for name, path in given.items() if _unfit(path)}
+    if "" in unfit:  # then all that is inside is, too
+        unfit = {name: path for name, path in unfit.items() if not name or not path.is_relative_to(PROJECT)}
+    if unfit:
+        raise UserError("\n".join(f"{name}{str(path)!a}: {_REMEDY[not name]}" for name, path in unfit.items()))
+
+
+_REMEDY = [
+    "is a path with blanks or with a character that means something to a shell; take another directory",
+    "this checkout lies on a path with blanks or with a character that means something to a shell; move it",
+]
+
+
+def _unfit(path: Path) -> bool:
+    return any(each in UNFIT for each in str(path)) or any(map(name_fault, path.parts))
 
 
 def shown(path: Path) -> str:

@@ -44,6 +44,7 @@ _VARIABLES = {"address", *_OF_ROBOTS, *_HOMES}
 
 def load_fleet(directory: Path | None = None) -> Fleet:
     """The fleet of an inventory, by default the project's; or ProblemsError with all that is wrong in it."""
+    paths.check()  # for playbooks, too
     directory = directory or paths.INVENTORY
     sources = Sources(directory)
     try:

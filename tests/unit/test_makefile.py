@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from flotilla.common import paths
+from flotilla.common.errors import UserError
+from flotilla.fleet import inventory
 
 HOSTILE = "a b;touch {file};'\"$HOME`touch {file}`$(touch {file})"
 RECORDER = """#!{python}
@@ -119,12 +122,68 @@ def test_each_variable_is_defined_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["BUILD", "KEYS", "APPS"])
-@pytest.mark.parametrize("value", ["a;id", "a b", "a`id`", "a'", 'a"'])
-def test_paths_that_a_shell_would_read_are_refused(name: str, value: str) -> None:
-    argv = ["make", "-C", str(paths.PROJECT), "-n", "help", f"{name}={value}"]
+@pytest.mark.parametrize("character", paths.UNFIT.replace("\n", ""))
+def test_paths_that_a_shell_would_read_are_refused(name: str, character: str) -> None:
+    """By make, before anything is installed, and where Python is started without it."""
+    value = f"/tmp/a{character}b"
+    given = value.replace("$", "$$").replace("#", "\\#")
+    argv = ["make", "-C", str(paths.PROJECT), "-n", "help", f"{name}={given}"]
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert f"{name}={value}: is a path with blanks or with a character that means something" in done.stderr
+    assert "is a path with blanks or with a character that means something to a shell; take another" in done.stderr
+    assert f"{name}=/tmp/a" in done.stderr
+    argv = [sys.executable, "-c", "from flotilla.common import paths; paths.check()"]
+    done = subprocess.run(argv, env=os.environ | {name: value}, capture_output=True, text=True, check=False)
+    assert f"UserError: {name}={value!a}: is a path with blanks or" in done.stderr
+
+
+def test_make_and_python_refuse_the_same_paths() -> None:
+    (listed,) = re.findall(r"^not_in_paths := (.*)$", (paths.PROJECT / "Makefile").read_text(), re.MULTILINE)
+    characters = {each.replace("$$", "$").replace("\\#", "#") for each in listed.split()}
+    assert characters == set(paths.UNFIT) - {" ", "\t", "\n"}
+
+
+@pytest.mark.parametrize("folder", ["my robots/ü'x", "two  blanks", "a\nb", "$HOME", 'quo"te', "100%"])
+def test_a_checkout_on_such_a_path_is_refused_at_once(tmp_path: Path, folder: str) -> None:
+    """By make, and by the program. Seen to fail: make installed an environment elsewhere, and a card had no keys."""
+    checkout = tmp_path / folder / "flotilla"
+    shutil.copytree(paths.PROJECT / "flotilla" / "common", checkout / "flotilla" / "common")
+    shutil.copy(paths.PROJECT / "Makefile", checkout)
+    before = sorted(checkout.rglob("*"))
+    for words in (["image", "ROBOT=3"], ["setup"], ["help"]):
+        done = subprocess.run(["make", "-C", str(checkout), *words], capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert f"{checkout}: this checkout lies on a path with blanks or with a character that means" in done.stderr
+    assert sorted(checkout.rglob("*")) == before
+    argv = [sys.executable, "-B", "-c", "from flotilla.common import paths; paths.check()"]
+    environment = {name: value for name, value in os.environ.items() if name not in ("BUILD", "KEYS", "APPS")}
+    done = subprocess.run(
+        argv, cwd=checkout, env=environment | {"PYTHONPATH": str(checkout)}, capture_output=True, text=True, check=False
+    )
+    assert f"UserError: {str(checkout)!a}: this checkout lies on a path with blanks" in done.stderr
+    assert done.stderr.count("lies on") == 1
+    assert "BUILD" not in done.stderr
+
+
+@pytest.mark.parametrize("folder", ["ü", "日本", "a-b_c.d,e+f@g~h"])
+def test_a_checkout_on_another_path_is_none_of_those(tmp_path: Path, folder: str) -> None:
+    shutil.copytree(paths.PROJECT / "flotilla" / "common", tmp_path / folder / "flotilla" / "common")
+    shutil.copy(paths.PROJECT / "Makefile", tmp_path / folder)
+    subprocess.run(["make", "-C", str(tmp_path / folder), "help"], stdout=subprocess.DEVNULL, check=True)
+    argv = [sys.executable, "-c", "from flotilla.common import paths; paths.check()"]
+    subprocess.run(argv, cwd=tmp_path / folder, env=os.environ | {"PYTHONPATH": str(tmp_path / folder)}, check=True)
+
+
+def test_every_command_and_every_playbook_checks_the_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen to fail where make alone did."""
+    monkeypatch.setattr(paths, "KEYS", Path("/tmp/my keys"))
+    with pytest.raises(UserError, match=r"^KEYS='/tmp/my keys': is a path with blanks"):
+        inventory.load_fleet()
+    argv = [sys.executable, "-m", "flotilla", "check-fleet"]
+    environment = os.environ | {"APPS": "/tmp/my apps", "KEYS": "/tmp/k'k"}
+    done = subprocess.run(argv, env=environment, cwd=paths.PROJECT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(r"""error: KEYS="/tmp/k'k": is a.*\nAPPS='/tmp/my apps': is a .*\n""", done.stderr)
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
