@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import threading
@@ -25,19 +26,20 @@ _COMMANDS = {
 """Programs by the Debian package that has them."""
 _USER_COMMANDS = {"newuidmap": "uidmap", "newgidmap": "uidmap"}
 """What ordinary users need besides, to map the users of the image."""
-_SPACE = 1 << 30
-"""Bytes of disk for the pool, one board's results and an image."""
+_SPACE = 32 << 20
+"""Bytes of disk without which nothing is begun."""
 _FULL = 16 << 20
 """Bytes below which a disk counts as full: files are larger than this."""
+_FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
 _was_full = threading.Event()
 """Once a failure found the disk full: what it removes then makes room, and work at the same time fails all the same."""
 _MEMORY = 1 << 30
 """Bytes of memory for the root file system while it is made."""
 
 
-def check() -> None:
-    """Refuse a build that could not succeed here."""
-    problems = [*_missing_commands(), *_missing_space(), *_missing_memory()]
+def check(space: int = _SPACE) -> None:
+    """Refuse a build that could not succeed here. `space`: bytes of disk that it takes, as far as that is known."""
+    problems = [*_missing_commands(), *_missing_space(space), *_missing_memory()]
     if problems:
         raise UserError("\n".join(problems))
 
@@ -55,13 +57,20 @@ def _missing_commands() -> list[str]:
     ]
 
 
-def _missing_space() -> list[str]:
+def check_space(needed: int) -> None:
+    """Refuse a build for which the disk has no room."""
+    if problems := _missing_space(needed):
+        raise UserError(*problems)
+
+
+def _missing_space(needed: int) -> list[str]:
+    needed = max(needed, _SPACE)
     paths.BUILD.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(paths.BUILD).free
-    if free >= _SPACE:
+    if free >= needed:
         return []
     return [
-        f"{paths.shown(paths.BUILD)}: {progress.size(free)} free on its disk, a build needs {progress.size(_SPACE)}; "
+        f"{paths.shown(paths.BUILD)}: {progress.size(free)} free on its disk, a build needs {progress.size(needed)}; "
         "make room, or choose another place with BUILD=directory"
     ]
 
@@ -89,11 +98,20 @@ def explaining_a_full_disk() -> Iterator[None]:
     except _FullDisk:
         raise
     except (UserError, OSError) as error:
-        if shutil.disk_usage(paths.BUILD).free <= _FULL:
+        free = shutil.disk_usage(paths.BUILD).free
+        if free <= _FULL or _says_full(error):
             _was_full.set()
         if not _was_full.is_set():
             raise
         raise _FullDisk(
-            f"{paths.shown(paths.BUILD)}: no space left on its disk, so the build failed; the last good images are "
-            f"untouched; make room, or choose another place with BUILD=directory ({str(error).splitlines()[0]})"
+            f"{paths.shown(paths.BUILD)}: no space left on its disk, {progress.size(free)} free, so the build failed; "
+            "the last good images are untouched; make room, or choose another place with BUILD=directory "
+            f"({str(error).splitlines()[0]})"
         ) from error
+
+
+def _says_full(error: UserError | OSError) -> bool:
+    """Whether it is a full disk's, or a quota's, as this program or one that it ran says it."""
+    if isinstance(error, OSError):
+        return error.errno in _FULL_DISK
+    return any(os.strerror(number) in str(error) for number in _FULL_DISK)

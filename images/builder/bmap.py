@@ -8,11 +8,12 @@ systems) and not the holes of the image file: an inode table full of zeros is a 
 from __future__ import annotations
 
 import hashlib
-import mmap
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 from xml.etree import ElementTree
 
 from flotilla.common import durable
@@ -20,6 +21,7 @@ from flotilla.common.errors import UserError
 from flotilla.common.paths import shown
 
 BLOCK = 4096
+_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -57,19 +59,24 @@ def block_map(image: Path, extents: Iterable[tuple[int, int]], known: Iterable[R
     """The map of `image`, of which the `extents` (offset and length in bytes, in any order) matter. `known`: ranges of
     another image that has the same there, which are not read again."""
     checksums = {(blocks.first, blocks.last): blocks.sha256 for blocks in known}
-    with image.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapping:
-        size = len(mapping)
-        with memoryview(mapping) as view:
-            ranges = tuple(
-                Range(
-                    first,
-                    last,
-                    checksums.get((first, last))
-                    or hashlib.sha256(view[first * BLOCK : (last + 1) * BLOCK]).hexdigest(),
-                )
-                for first, last in _blocks(extents, size)
-            )
+    # Read, not mapped: a page of a hole that is mapped takes memory of a tmpfs, and there may be none left.
+    with image.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        ranges = tuple(
+            Range(first, last, checksums.get((first, last)) or _hash(file, first * BLOCK, (last + 1) * BLOCK))
+            for first, last in _blocks(extents, size)
+        )
     return BlockMap(size, ranges)
+
+
+def _hash(file: IO[bytes], start: int, end: int) -> str:
+    """SHA-256 of a range of bytes, or of what the file has of it."""
+    digest = hashlib.sha256()
+    file.seek(start)
+    while chunk := file.read(min(_CHUNK, end - start)):
+        digest.update(chunk)
+        start += len(chunk)
+    return digest.hexdigest()
 
 
 def write_bmap(image: Path, extents: Iterable[tuple[int, int]], bmap: Path, known: Iterable[Range] = ()) -> BlockMap:

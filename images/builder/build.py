@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import identity, release_keys
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Board, Fleet, Releases, Robot
-from images.builder import bmap, card, data_partition, manifest, pool, rootfs, runtime, slot, tools
+from images.builder import bmap, card, data_partition, manifest, pool, rootfs, runtime, slot, space, tools
 from images.builder.filesystem import Node
 from images.builder.lock import Lock, board_lock, read_lock
 
@@ -41,6 +41,7 @@ def image_of(robot: Robot, directory: Path = paths.IMAGES) -> Path:
 def board_build(board: Board, releases: Releases | None = None) -> BoardBuild:
     """Everything up to the identity; from the cache where nothing changed. `releases`: who signs them."""
     lock, tools_lock = board_lock(board), read_lock("tools")
+    check_space([board])
     fill_pool(board)
     root = rootfs.build(board, lock, tools_lock)  # first: it unpacks the tools while the runtime is compiled
     toolset = tools.Tools(tools.tree(tools_lock), lock.epoch)
@@ -52,9 +53,25 @@ def board_build(board: Board, releases: Releases | None = None) -> BoardBuild:
 
 def fill_pool(board: Board) -> None:
     """Download what the build of a board lacks, all of it at once."""
+    pool.fill([_root_lock(board), *_tree_locks(board)])
+
+
+def _root_lock(board: Board) -> Lock:
+    """What the pool needs of the board's lock: a kernel of our own is no package of Debian's."""
     lock = board_lock(board)
-    wanted = runtime.wanted(board.system)
-    pool.fill([lock.without("kernel") if board.kernel == "lean" else lock, read_lock("tools"), *wanted])
+    return lock.without("kernel") if board.kernel == "lean" else lock
+
+
+def _tree_locks(board: Board) -> list[Lock]:
+    """Of the tools that a build of the board runs, and of the compilers if its runtime is to be built."""
+    return [read_lock("tools"), *runtime.wanted(board.system)]
+
+
+def check_space(boards: Iterable[Board], images: Sequence[Board] = ()) -> None:
+    """Refuse a build of `boards`, and of cards of `images`, for which the disk has no room."""
+    boards = list(boards)
+    trees = [lock for board in boards for lock in _tree_locks(board)]
+    host.check_space(space.needed(trees, list(map(_root_lock, boards)), list(map(_root_lock, images))))
 
 
 def build(
@@ -69,9 +86,10 @@ def build(
     """
     host.check()
     namespace.check()
-    with cache.exclusive():
+    names = dict.fromkeys(robot.board for robot in robots)
+    with host.explaining_a_full_disk(), cache.exclusive():
         boards: dict[str, BoardBuild] = {}
-        names = dict.fromkeys(robot.board for robot in robots)
+        check_space([fleet.boards[name] for name in names], [fleet.boards[robot.board] for robot in robots])
         for name in names:
             fill_pool(fleet.boards[name])
 

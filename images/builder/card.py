@@ -31,7 +31,7 @@ from typing import Annotated, NamedTuple
 
 import pydantic
 
-from flotilla.common import cache, paths, yaml_file
+from flotilla.common import cache, host, paths, yaml_file
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Integer, between
 from images.builder import copying, environment_block, filesystem, uefi
@@ -272,9 +272,12 @@ def data_partition(
     board: Board, tools: Tools, out: Path, nodes: list[Node], epoch: int, start: int | None = None
 ) -> Extents:
     """Write the data partition with the robot's files, as the file `out`, or so many bytes behind its beginning."""
-    return filesystem.make(
-        tools, out, data(board).size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch, start=start
-    )
+    with (
+        host.explaining_a_full_disk()
+    ):  # here, because debugfs says nothing of it, and the caller removes what fills it
+        return filesystem.make(
+            tools, out, data(board).size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch, start=start
+        )
 
 
 def grub_config(board: Board) -> bytes:

@@ -46,10 +46,20 @@ def copy(source: Path, extents: Extents, target: Path, start: int = 0, *, past_p
         for offset, length in extents:
             at, end = offset, offset + length
             while at < end:
-                copied = os.copy_file_range(file.fileno(), out.fileno(), end - at, at, start + at)
+                copied = _copy_some(file.fileno(), at, end - at, out.fileno(), start + at)
                 if not copied:
                     raise UserError(f"{source} became shorter while it was copied")
                 at += copied
+
+
+def _copy_some(source: int, at: int, length: int, target: int, start: int) -> int:
+    """How many bytes were copied; by the kernel, if it does so from this file system to that one."""
+    try:
+        return os.copy_file_range(source, target, length, at, start)
+    except OSError as error:
+        if error.errno not in _REFUSALS:
+            raise
+    return os.pwrite(target, os.pread(source, min(length, _AT_ONCE), at), start)
 
 
 def whole_pages(extents: Extents) -> list[tuple[int, int]]:

@@ -6,7 +6,7 @@ encryption. The file system's own structure is e2fsck's to check.
 
 from __future__ import annotations
 
-import mmap
+import os
 import stat
 import struct
 from collections.abc import Iterator
@@ -50,8 +50,8 @@ class Reader:
     """The file system that lies `start` bytes behind the beginning of `image`."""
 
     def __init__(self, image: Path, start: int = 0) -> None:
-        with image.open("rb") as file:
-            self._image = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        # Read, not mapped: a page of a hole that is mapped takes memory of a tmpfs, and there may be none left.
+        self._image = image.open("rb", buffering=0)
         self._start = start
         block = self._at(1024, 1024)
         if struct.unpack_from("<H", block, 56)[0] != _MAGIC:
@@ -89,7 +89,7 @@ class Reader:
                     waiting.append((path, inode))
 
     def _at(self, offset: int, length: int) -> bytes:
-        found = self._image[self._start + offset : self._start + offset + length]
+        found = os.pread(self._image.fileno(), length, self._start + offset)
         if len(found) != length:
             raise Unreadable(f"it ends before byte {offset + length}")
         return found

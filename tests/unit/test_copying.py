@@ -67,6 +67,17 @@ def test_a_source_that_is_too_short_is_refused(directory: Path, source: Path) ->
     assert not target.stat().st_size
 
 
+@pytest.mark.parametrize("past", [False, True])
+def test_a_copy_goes_to_another_file_system(tmp_path: Path, source: Path, past: bool) -> None:
+    """As where build/cache is a link to another disk. Seen to fail with "Invalid cross-device link"."""
+    with tempfile.TemporaryDirectory(dir=tmp_path if source.is_relative_to(SHM) else SHM) as name:
+        target = Path(name, "target")
+        target.touch()
+        os.truncate(target, SIZE)
+        copying.copy(source, EXTENTS, target, past_page_cache=past)
+        assert target.read_bytes() == source.read_bytes()
+
+
 @pytest.mark.parametrize(
     ("extents", "pages"),
     [

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import threading
 from collections import namedtuple
 from pathlib import Path
 
@@ -40,10 +42,36 @@ def test_an_ordinary_user_also_needs_newuidmap(monkeypatch: pytest.MonkeyPatch) 
 def test_a_full_disk_is_refused_before_the_build(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(paths, "BUILD", tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: _Usage(1 << 40, 1 << 40, 100 << 20))
-    with pytest.raises(
-        UserError, match=r"100\.0 MiB free on its disk, a build needs 1\.0 GiB; make room, or .* BUILD="
-    ):
-        host.check()
+    host.check()
+    host.check_space(100 << 20)
+    for check in (host.check, host.check_space):
+        with pytest.raises(
+            UserError, match=r"100\.0 MiB free on its disk, a build needs 101\.0 MiB; make room, or .* BUILD="
+        ):
+            check(101 << 20)
+
+
+@pytest.mark.parametrize(
+    ("error", "full"),
+    [
+        (OSError(errno.ENOSPC, "x"), True),
+        (OSError(errno.EDQUOT, "x"), True),
+        (UserError("mke2fs failed: No space left on device"), True),
+        (OSError(errno.EIO, "x"), False),
+        (UserError("mke2fs failed: something else"), False),
+    ],
+)
+def test_a_full_disk_is_said_though_there_is_room_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Exception, full: bool
+) -> None:
+    """What was being written is removed first. Seen to fail: the error came as a traceback."""
+    monkeypatch.setattr(paths, "BUILD", tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: _Usage(1 << 40, 1 << 39, 1 << 30))
+    monkeypatch.setattr(host, "_was_full", threading.Event())
+    with pytest.raises(UserError if full else type(error)) as caught, host.explaining_a_full_disk():
+        raise error
+    said = f"{tmp_path}: no space left on its disk, 1.0 GiB free, so the build failed; the last good images are"
+    assert str(caught.value).startswith(said) == full
 
 
 def test_too_little_memory_is_refused(tmp_path: Path) -> None:
