@@ -7,6 +7,7 @@ it: when the builder dies, however it dies, the kernel ends the stage and takes 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,37 @@ from pathlib import Path
 
 from flotilla.common import paths, progress, together
 from flotilla.common.errors import UserError
+
+_CAPABILITIES = {
+    "CAP_CHOWN": (0, "gives files to the users of the image"),
+    "CAP_DAC_OVERRIDE": (1, "writes the files of these users"),
+    "CAP_FOWNER": (3, "sets the modes of their files"),
+    "CAP_FSETID": (4, "keeps set-group-ID bits"),
+    "CAP_SETGID": (6, "runs programs of packages as other groups"),
+    "CAP_SETUID": (7, "runs them as other users"),
+    "CAP_SYS_CHROOT": (18, "runs the locked tools in their tree"),
+    "CAP_SYS_ADMIN": (21, "mounts, in namespaces of its own"),
+    "CAP_SETFCAP": (31, "gives programs capabilities, such as ping's, which is set-user-ID without"),
+}
+"""What a stage needs of root: the numbers (linux/capability.h), and what a build does with each."""
+
+
+def missing_capabilities(status: str) -> list[str]:
+    """Those that a process has not, by its /proc/PID/status."""
+    effective = int(re.findall(r"^CapEff:\s*([0-9a-f]+)$", status, re.MULTILINE)[0], 16)
+    return [f"{name} ({what})" for name, (number, what) in _CAPABILITIES.items() if not effective >> number & 1]
+
+
+def _check_capabilities() -> None:
+    """Root of a container, or of a service, may have few: packages are then installed otherwise, and nothing fails."""
+    # Of a program that root starts, whatever this one gave up.
+    status = subprocess.run(["cat", "/proc/self/status"], capture_output=True, text=True, check=True).stdout
+    if missing := missing_capabilities(status):
+        options = " ".join(f"--cap-add={each.split()[0].removeprefix('CAP_')}" for each in missing)
+        raise UserError(
+            f"root has no {', '.join(missing)} here, which building an image needs; give the container these "
+            f"capabilities (docker run {options} …), or build as an ordinary user"
+        )
 
 
 def _refusal(stderr: str) -> UserError:
@@ -41,9 +73,12 @@ def _refusal(stderr: str) -> UserError:
             "add one with `sudo usermod --add-subuids 100000-165535 --add-subgids 100000-165535 $USER`, "
             "or build as root with `sudo make image …`"
         )
-    return UserError(
-        f"this computer refuses a mount namespace: {stderr.strip()}; build as root with `sudo make image …`"
+    remedy = (
+        "build on a computer, or in a container, that allows one"
+        if os.geteuid() == 0
+        else ("build as root with `sudo make image …`")
     )
+    return UserError(f"this computer refuses a mount namespace: {stderr.strip()}; {remedy}")
 
 
 def prefix(*more: str, root: bool | None = None) -> list[str]:
@@ -64,6 +99,8 @@ def check() -> None:
     unshare(1) forks a child that maps users, and leaves it waiting for ever when the kernel refuses: so not the end of
     what they write is awaited, but that of the program itself, and the rest of its group is killed.
     """
+    if os.geteuid() == 0:
+        _check_capabilities()
     argv = [*prefix(), "mount", "-t", "tmpfs", "none", "/mnt"]
     with tempfile.TemporaryFile("w+") as output:
         probe = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0)

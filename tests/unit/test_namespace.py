@@ -113,3 +113,29 @@ def test_a_user_without_a_range_is_told_how_to_get_one(monkeypatch: pytest.Monke
     message = str(namespace._refusal("newuidmap: uid range [1-65536) -> [100000-165535) not allowed"))
     assert message.startswith("/etc/subuid: no range for ada")
     assert "--add-subuids" in message
+
+
+CHECK = """
+from flotilla.common import namespace
+from flotilla.common.errors import UserError
+try:
+    namespace.check()
+except UserError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("name", [*namespace._CAPABILITIES, ""])
+def test_root_without_a_capability_is_told_which(name: str) -> None:
+    """Seen to fail: without CAP_SETFCAP, an image was made whose ping is set-user-ID. In a user namespace, so that
+    ordinary users' tests have a root to take something from; that of root itself is no other."""
+    dropped = name.removeprefix("CAP_").lower()
+    less = ["setpriv", f"--bounding-set=-{dropped}", f"--inh-caps=-{dropped}", "--"] if name else []
+    done = subprocess.run(
+        ["unshare", "--user", "--map-root-user", *less, sys.executable, "-c", CHECK],
+        cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.count("CAP_") == bool(name)
+    if name:
+        assert f"root has no {name} (" in done.stdout
+        assert f"docker run --cap-add={name.removeprefix('CAP_')} " in done.stdout
