@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from flotilla.common import cache, host, namespace, paths
+from flotilla.common import cache, host, namespace, paths, sources
 from flotilla.common.errors import UserError
 from flotilla.fleet import apps, interfaces
 from flotilla.fleet.apps import BuiltApp
@@ -65,16 +65,28 @@ def _built(name: str, board: Board) -> BuiltApp:
 
     subject = app.load(paths.APPS / name)
     apps.check_names(subject.directory)
-    # Rather too much, all of this package and of the builder, than too little.
-    key = cache.digest(
-        runtime.key(board.system), str(board.system), subject.directory, Path(__file__).parent,
-        Path(runtime.__file__).parent,
-    )  # fmt: skip
 
     def make(out: Path) -> None:
         builder.build(subject, board, out / name)
 
+    key = key_of(subject.directory, runtime.key(board.system), str(board.system))
     return apps.read(name, cache.result("app", key, make) / name, remote.linked(subject))
+
+
+def key_of(directory: Path, *words: str) -> str:
+    """Hash of all that decides what is built of the app in `directory`; `words`: what it is built for, and with.
+
+    Rather too much, all of this package and of those that it uses, than too little.
+    """
+    package, project = Path(__file__).parent, paths.PROJECT
+    used = [package, project / "images/builder", project / "flotilla/fleet", project / "flotilla/common"]
+    return cache.digest(*words, directory, *behind_links(directory), *used, project / "requirements.lock")
+
+
+def behind_links(directory: Path) -> list[Path]:
+    """The files outside of an app's directory that its links lead to: a build reads them as its own."""
+    links = [path.resolve() for path in sources.files(directory) if path.is_symlink()]
+    return [path for path in links if path.exists() and not path.is_relative_to(directory.resolve())]
 
 
 def repairs(actions: Sequence[tuple[str, str]], there: Sequence[BuiltApp]) -> list[dict[str, Any]]:

@@ -11,14 +11,14 @@ from pathlib import Path
 import yaml
 
 from flotilla.apps import app, ert, fmu
-from flotilla.common import cache, paths, progress
+from flotilla.common import cache, paths, progress, sources
 from flotilla.common.errors import UserError
 from flotilla.fleet import privileges
 from flotilla.fleet.model import Board, System
 from images.builder import runtime, toolchain
 
-_BUILT = ("*.o", "*.d", ".git")
-"""What a copy of a project leaves out: what its own build left behind may be for another processor."""
+_BUILT = ("*.o", "*.d")
+"""What a copy of a project leaves out besides: what its own build left behind may be for another processor."""
 _NO_DATA = re.compile(
     r"[^.]*|\..*|.*\.(c|h|cc|cpp|cxx|hh|hpp|hxx|inc|s|S|asm|o|d|a|mk|am|ac|in|cmake|py|sh|md|rst)"
     r"|(app|safe)\.yml|(CMakeLists|README|LICENSE)\.txt"
@@ -32,6 +32,7 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
     `run` says where the robot's code is compiled.
     """
     paths.BUILD.mkdir(parents=True, exist_ok=True)
+    sources.files(subject.directory)  # refuses what cannot be sent
     with cache.exclusive(), progress.step(f"{subject.name} for {board.system}"):
         (out / "unit.d").mkdir(parents=True)  # what the app's service has beyond runtime/systemd/
         description = subject.description
@@ -71,7 +72,7 @@ def _blocks(
     task = subject.directory / app.TASK
     (out / "blocks").mkdir()
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".blocks-") as directory:
-        if any(source.glob("*.c")):
+        if any(path.parent == source and path.suffix == ".c" for path in sources.files(source)):
             plugin = runtime.compile_plugin(source, system, options, run)
             (out / "blocks" / f"{subject.name}.so").write_bytes(plugin)
             (Path(directory) / f"{subject.name}.so").write_bytes(plugin)
@@ -97,7 +98,9 @@ def _make(subject: app.App, description: app.Make, system: System, out: Path, ru
         shutil.copyfile(safe, out / app.SAFE)
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".make-") as directory:
         source = Path(directory) / "source"
-        shutil.copytree(subject.directory, source, symlinks=True, ignore=shutil.ignore_patterns(*_BUILT))
+        shutil.copytree(
+            subject.directory, source, symlinks=True, ignore=shutil.ignore_patterns(*sources.LEFT_BEHIND, *_BUILT)
+        )
         made = source / description.program
         made.unlink(missing_ok=True)
         # From the environment, because a Makefile may add to these; it cannot to what stands on make's command line.
@@ -119,6 +122,8 @@ def _send_along(subject: app.App, description: app.Make, source: Path, out: Path
     where = paths.shown(subject.directory / app.FILE)
     for name in description.files or []:
         sent, taken = source / name, out / name
+        if any(map(sources.left_behind, Path(name).parts)):
+            raise UserError(f"{where}: files: {name}: is what programs leave behind, by its name; give it another")
         if not sent.exists():
             raise UserError(f"{where}: files: {name}: is not there, and make does not make it; name what there is")
         if taken.exists():
@@ -127,7 +132,7 @@ def _send_along(subject: app.App, description: app.Make, source: Path, out: Path
             raise UserError(f"{where}: files: {name}: has a link to outside the app; put a copy in its place")
         taken.parent.mkdir(parents=True, exist_ok=True)
         if sent.is_dir():
-            shutil.copytree(sent, taken)
+            shutil.copytree(sent, taken, ignore=sources.ignored)
         else:
             shutil.copy(sent, taken)
     if description.files is None and (left := _left(subject, description, source)):
@@ -138,7 +143,7 @@ def _send_along(subject: app.App, description: app.Make, source: Path, out: Path
 
 def _left(subject: app.App, description: app.Make, source: Path) -> list[str]:
     """What the program may need, and does not get: data of the project, and libraries that make made."""
-    data = {path.relative_to(subject.directory) for path in _below(subject.directory) if path.is_file()}
+    data = {path.relative_to(subject.directory) for path in sources.files(subject.directory) if path.is_file()}
     hidden = {path for path in data if any(part.startswith(".") for part in path.parts)}
     data = {path for path in data - hidden if not _NO_DATA.fullmatch(path.name)}
     libraries = {path.relative_to(source) for path in _below(source) if ".so" in path.suffixes}

@@ -23,6 +23,7 @@ from pycparser import c_ast, c_parser
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.common.sources import LEFT_BEHIND
 from flotilla.fleet.model import System
 from images.builder import runtime
 
@@ -232,7 +233,7 @@ def collect(generated: Path, model: str, out: Path) -> Code:
             raise _cplusplus(model)
         remedy = f"{GENERATED}/ holds what Embedded Coder made of the model, whose name is the key model's"
         raise UserError(f"{paths.shown(generated / f'{model}{kind}')} is missing; {remedy}")
-    shutil.copytree(generated, out, ignore=shutil.ignore_patterns(*_MAINS, "*.o", "html"))
+    shutil.copytree(generated, out, ignore=shutil.ignore_patterns(*LEFT_BEHIND, *_MAINS, "*.o", "html"))
     for file in sorted(out.rglob("*.[ch]")):
         place = out / file.name
         if place.exists() and place.read_bytes() != file.read_bytes():

@@ -24,6 +24,7 @@ import jinja2
 from flotilla.apps import app
 from flotilla.common import paths
 from flotilla.common.errors import Problem, UserError
+from flotilla.common.sources import ignored
 from flotilla.fleet.model import System
 from images.builder import runtime, toolchain
 
@@ -430,7 +431,7 @@ def binary(unit: Unit, system: System) -> Path:
 
 def block(unit: Unit, name: str, out: Path) -> None:
     """Fill `out` with the C files of a plug-in whose block is `name`."""
-    shutil.copytree(HEADERS, out)
+    shutil.copytree(HEADERS, out, ignore=ignored)
     (out / "flotilla_block.c").write_text(render(unit, name))
 
 
@@ -462,10 +463,10 @@ def build(unit: Unit, name: str, system: System, out: Path, run: toolchain.Run =
         final.chmod(0o755)  # as linkers leave it
     else:
         place = binary(unit, system)
-        shutil.copytree(place, final.parent, dirs_exist_ok=True)
+        shutil.copytree(place, final.parent, ignore=ignored, dirs_exist_ok=True)
         (final.parent / f"{unit.identifier}.so").rename(final)
     if unit.resources:
-        shutil.copytree(unit.directory / "resources", final.parent.parent / "resources")
+        shutil.copytree(unit.directory / "resources", final.parent.parent / "resources", ignore=ignored)
 
 
 def _sources_unless_binary(unit: Unit, system: System) -> Sources | None:
@@ -486,8 +487,8 @@ def _compiled(unit: Unit, found: Sources, system: System, run: toolchain.Run) ->
     """The unit's sources as a shared object."""
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as directory:
         tree = Path(directory) / "source"
-        shutil.copytree(unit.directory / "sources", tree / "sources")
-        shutil.copytree(HEADERS, tree / "fmi")
+        shutil.copytree(unit.directory / "sources", tree / "sources", ignore=ignored)
+        shutil.copytree(HEADERS, tree / "fmi", ignore=ignored)
         options = ["-std=gnu17", "-Wall", "-Wl,-Bsymbolic,-z,defs", "-Isources", "-Ifmi", *found.options]
         files = [f"sources/{name}" for name in found.files]
         return runtime.compile_shared(tree, files, system, options, run)

@@ -20,11 +20,11 @@ import stat
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flotilla.common import durable, host, paths, progress
+from flotilla.common import durable, host, paths, progress, sources
 
 _KEPT = 4
 """The newest results of a kind, which stay whoever used them: with two boards, the present one and the one before."""
@@ -40,23 +40,32 @@ _making: dict[Path, threading.Lock] = {}
 
 
 def digest(*parts: str | bytes | Path) -> str:
-    """SHA-256 over texts, and over files and directory trees with their names and executable bits."""
+    """SHA-256 over texts, and over files and directory trees (`sources.files`) with their names and executable bits."""
     total = hashlib.sha256()
     for part in parts:
         if isinstance(part, Path):
-            for path in sorted(part.rglob("*")) if part.is_dir() else [part]:
-                if "__pycache__" in path.parts or path.is_dir():
-                    continue
-                name = str(path.relative_to(part.parent))
-                if path.is_symlink():
-                    content, kind = str(path.readlink()).encode(), "link"
-                else:
-                    content, kind = path.read_bytes(), "x" if os.access(path, os.X_OK) else "-"
-                total.update(f"{kind} {len(name)} {name} {len(content)}\n".encode() + content)
+            for path in sources.files(part) if part.is_dir() else [part]:
+                total.update(_entry(path, os.fsencode(path.relative_to(part.parent))))
         else:
             data = part.encode() if isinstance(part, str) else part
             total.update(f"text {len(data)}\n".encode() + data)
     return total.hexdigest()
+
+
+def digest_of(directory: Path, files: Iterable[Path]) -> str:
+    """SHA-256 over some of the files below a directory, with their paths from there and executable bits."""
+    total = hashlib.sha256()
+    for path in files:
+        total.update(_entry(path, os.fsencode(path.relative_to(directory))))
+    return total.hexdigest()
+
+
+def _entry(path: Path, name: bytes) -> bytes:
+    if path.is_symlink():
+        content, kind = os.fsencode(path.readlink()), b"link"
+    else:
+        content, kind = path.read_bytes(), b"x" if sources.executable(path) else b"-"
+    return b"%b %d %b %d\n" % (kind, len(os.fsdecode(name)), name, len(content)) + content
 
 
 def result(kind: str, key: str, make: Callable[[Path], None]) -> Path:

@@ -7,14 +7,13 @@ needs its files alone: here they are data.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import yaml
 
-from flotilla.common import cache, paths
+from flotilla.common import cache, paths, sources
 from flotilla.common.errors import UserError
 
 FILE = "app.yml"
@@ -85,14 +84,11 @@ class BuiltApp:
 def read(name: str, directory: Path, program: str = "") -> BuiltApp:
     """The app that a build has put into `directory`. Modes are the two that are sent to robots."""
     check_names(directory)
-    found = sorted(directory.rglob("*"))
-    inside = {path: PurePosixPath(path.relative_to(directory)) for path in found}
     files = {
-        inside[path]: (path.read_bytes(), 0o755 if os.access(path, os.X_OK) else 0o644)
-        for path in found
-        if path.is_file()
+        PurePosixPath(path.relative_to(directory)): (path.read_bytes(), 0o755 if sources.executable(path) else 0o644)
+        for path in sources.files(directory)
     }
-    directories = tuple(inside[path] for path in found if path.is_dir())
+    directories = tuple(PurePosixPath(path.relative_to(directory)) for path in _directories(directory))
     return BuiltApp(name, version(directory), files, directories, program)
 
 
@@ -103,9 +99,15 @@ def check_names(directory: Path) -> None:
         raise UserError("\n".join(f"{str(path.relative_to(directory))!a}: {fault}" for path, fault in faults))
 
 
+def _directories(directory: Path) -> list[Path]:
+    found = (path for path in directory.rglob("*") if path.is_dir())
+    return sorted(path for path in found if not any(map(sources.left_behind, path.relative_to(directory).parts)))
+
+
 def version(directory: Path) -> str:
-    """The version of the app that a build has put into `directory`."""
-    return cache.digest(*sorted(directory.iterdir()))[:16]
+    """The version of the app that a build has put into `directory`: of all that robots get of it."""
+    directories = (str(path.relative_to(directory)) for path in _directories(directory))
+    return cache.digest(cache.digest_of(directory, sources.files(directory)), *directories)[:16]
 
 
 def names() -> list[str]:

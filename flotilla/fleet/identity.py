@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
-from flotilla.common import paths
+from flotilla.common import paths, sources
 from flotilla.common.errors import UserError
 from flotilla.fleet import apps, dds_security, interfaces, keys, message_keys, operators, privileges, transport
 from flotilla.fleet.apps import BuiltApp
@@ -81,6 +81,11 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
     }
 
 
+def templates() -> list[Path]:
+    """The overlay's files that are rendered for each robot."""
+    return [path for path in sources.files(paths.OVERLAY) if path.suffix == ".j2"]
+
+
 @functools.cache
 def _environment() -> jinja2.Environment:
     import jinja2  # here, because it takes a while, in which the build has other things to do
@@ -109,7 +114,7 @@ def render(fleet: Fleet, robot: Robot, built: Sequence[BuiltApp] = ()) -> dict[P
     descriptions = {name: description for name, (_, description) in tasks.items()}
     values = variables(fleet, robot) | {"device_users": privileges.device_users(descriptions)}
     files = {}
-    for template in sorted(paths.OVERLAY.rglob("*.j2")):
+    for template in templates():
         name = PurePosixPath(template.relative_to(paths.OVERLAY))
         each: dict[PurePosixPath, dict[str, object]] = {name.with_suffix(""): {}}
         if name == _CAN:

@@ -73,6 +73,8 @@ class Layout(pydantic.BaseModel):
 
 
 LAYOUT = yaml_file.read(_LAYOUT, Layout)
+SOURCES = (_GRUB_TEMPLATE, _LAYOUT)
+"""The files of images/boot/ that decide a card's bytes."""
 
 
 @dataclass(frozen=True)
@@ -169,8 +171,9 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
     `slot`: what `slot.build` made, for slot A.
     """
     key = cache.digest(
-        slot.name, tools.directory.name, str(epoch), board.model_dump_json(), _GRUB_TEMPLATE, _LAYOUT, Path(__file__),
+        slot.name, tools.directory.name, str(epoch), board.model_dump_json(), *SOURCES, Path(__file__),
         Path(filesystem.__file__), Path(environment_block.__file__), Path(copying.__file__), Path(uefi.__file__),
+        paths.PROJECT / "requirements.lock",  # jinja2
     )  # fmt: skip
 
     def make(out: Path) -> None:

@@ -25,10 +25,13 @@ import pydantic
 from flotilla.common import cache, durable, host, namespace, paths, progress, yaml_file
 from flotilla.common.errors import Problem, ProblemsError, UserError
 from flotilla.fleet.model import Architecture, Board
-from images.builder import kernel_stage, pool, tools
+from images.builder import chroot, kernel_stage, pool, tools
 from images.builder.lock import Package, read_lock
 
 _SOURCE = re.compile(r"linux-source-[0-9.]+")
+_KIND = "kernel"
+"""Of results in the cache."""
+MADE_BY = (kernel_stage.__file__, chroot.__file__, namespace.__file__)
 _SPACE = 4 << 30
 """Bytes of disk for the source and its objects."""
 
@@ -274,23 +277,28 @@ def build(name: str) -> Kernel:
         with progress.step(f"kernel {name}", lambda: far(progress.text(log), recipe(name).files)):
             _run(stage, "build", log)
 
-    return Kernel(cache.result("kernel", key(name), make))
+    return Kernel(cache.result(_KIND, key(name), make))
 
 
 def key(name: str) -> str:
     """Hash of all that decides a kernel's bytes."""
     lock = read_lock("toolchain")
-    made_by = [Path(kernel_stage.__file__), Path(kernel_stage.__file__).with_name("chroot.py")]
     made_of = recipe(name)
     options = request(wanted(name).values())
     return cache.digest(
-        lock.digest, made_of.architecture, options, f"modules {made_of.modules}", *patches(name), *made_by
-    )
+        tools.name(lock), lock.digest, source(lock.packages).name, made_of.architecture, options,
+        f"modules {made_of.modules}", *patches(name), *map(Path, MADE_BY),
+    )  # fmt: skip
+
+
+def name_of(name: str) -> str:
+    """Of the directory of what `build` makes; it need not be made yet."""
+    return cache.name(_KIND, key(name))
 
 
 def unbuilt(names: Iterable[str]) -> list[str]:
     """Those of these kernels that the cache lacks, which take minutes to build."""
-    return [name for name in names if not cache.has("kernel", key(name))]
+    return [name for name in names if not cache.has(_KIND, key(name))]
 
 
 def far(log: str, files: int) -> progress.Far:

@@ -50,8 +50,10 @@ class Description:
 
 def apply(patches: Sequence[str], source: Path, what: str) -> None:
     """Apply patches to a source, exactly; SystemExit with the one that does not fit `what`."""
-    # Without a repository above, whose folder git would take the paths to be in.
-    environment = os.environ | {"GIT_CEILING_DIRECTORIES": str(source.parent)}
+    # Without a repository above, whose folder git would take the paths to be in, and without this computer's settings.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    environment |= {"GIT_CEILING_DIRECTORIES": str(source.parent), "GIT_CONFIG_NOSYSTEM": "1"}
+    environment |= {"GIT_CONFIG_GLOBAL": os.devnull}
     for patch in patches:
         argv = ["git", "apply", "--whitespace=nowarn", patch]
         if subprocess.run(argv, cwd=source, env=environment, check=False).returncode:

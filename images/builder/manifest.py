@@ -26,7 +26,7 @@ from flotilla.common import cache, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Board, Fleet, Robot
-from images.builder import card, compare, mirror, runtime
+from images.builder import card, compare, mirror, rootfs, slot
 from images.builder.filesystem import Node
 from images.builder.lock import Lock
 from images.builder.tools import Tools
@@ -461,11 +461,9 @@ def inputs_of_board(board: Board, locks: tuple[Lock, Lock]) -> str:
     """One hash over all that goes into the images of a board's robots, but for what is a robot's own: rather too much
     (all of the builder) than too little."""
     images = paths.PROJECT / "images"
-    own_kernel = [paths.PROJECT / "kernel", paths.LOCKS / "toolchain.lock"] if board.kernel == "lean" else []
     return cache.digest(
-        *(lock.digest for lock in locks), *own_kernel, runtime.key(board.system), paths.OVERLAY,
-        images / "release.yml", images / "rootfs", images / "boot", images / "builder",
-        paths.PROJECT / "flotilla" / "fleet", paths.PROJECT / "flotilla" / "common",
+        *(lock.digest for lock in locks), rootfs.key(board, *locks), *card.SOURCES, slot.RELEASE_FILE,
+        images / "builder", paths.PROJECT / "flotilla" / "fleet", paths.PROJECT / "flotilla" / "common",
         paths.PROJECT / "requirements.lock",
         board.model_dump_json(),
     )  # fmt: skip

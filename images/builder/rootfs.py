@@ -21,14 +21,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from flotilla.common import cache, namespace, paths, progress, together
+from flotilla.common import cache, namespace, paths, progress, sources, together
 from flotilla.fleet import privileges
 from flotilla.fleet.model import Board
 from images.builder import deb, debian_kernel, initramfs, kernel, pool, runtime, tools
 from images.builder.chroot import Chroot, mount
 from images.builder.lock import Lock
 
-_DATA = paths.PROJECT / "images" / "rootfs"
+DATA = paths.PROJECT / "images" / "rootfs"
 COMPRESSION = ["-comp", "zstd", "-Xcompression-level", "15", "-b", "128K", "-no-fragments"]
 """zstd: a Pentium III unpacks it several times faster than xz, at about 8 % more bytes. A boot reads hundreds of small
 files; packed together in fragments, each would cost it the unpacking of a whole block."""
@@ -40,9 +40,11 @@ _PACKAGE = re.compile(r"^(?:I: (?:Unpacking|Configuring) [^ ]+|(?:Unpacking|Sett
 """What debootstrap and dpkg say of a package, twice of each."""
 _RUNTIME = "runtime"
 """A pipe in the stage's repository. It says the name of the runtime's package there, as soon as that is compiled."""
+NOT_PACKED = ("dev", "proc", "sys", "run", "tmp")
+"""Directories of the root that are empty in its image."""
 _REPOSITORY = "/tmp/repository"
 """Where the root has the stage's repository while it is made; nothing of /tmp is packed."""
-_STAGE_FILES = ("rootfs.py", "chroot.py", "deb.py", "debian_kernel.py", "initramfs.py", "init")
+MADE_BY = ("rootfs.py", "pool.py", "chroot.py", "deb.py", "debian_kernel.py", "initramfs.py", "init")
 
 
 def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
@@ -53,19 +55,6 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
     own = kernel.board_kernel(board) if board.kernel == "lean" else None
     if own:
         lock = lock.without("kernel")
-    sources = [Path(__file__).parent / name for name in _STAGE_FILES]
-    key = cache.digest(
-        lock.digest,
-        tools_lock.digest,
-        own.directory.name if own else "",
-        runtime.name(board.system),
-        debian_kernel.PACKER,
-        board.model_dump_json(include={"disk_modules", "architecture", "console"}),
-        _DATA,
-        json.dumps(privileges.USERS),
-        *sources,
-        *_overlay_files(),
-    )
 
     def make(out: Path) -> None:
         """The runtime is compiled meanwhile: the stage needs it late, and leaves a processor idle until then."""
@@ -109,7 +98,24 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
             shutil.rmtree(repository)
             (out / "stage.json").unlink()
 
-    return cache.result("rootfs", key, make)
+    return cache.result("rootfs", key(board, lock, tools_lock), make)
+
+
+def key(board: Board, lock: Lock, tools_lock: Lock) -> str:
+    """Hash of all that decides the root's bytes. `lock`: without the kernel, where the board has one of ours."""
+    return cache.digest(
+        lock.digest,
+        tools.name(tools_lock),
+        kernel.name_of(board.name) if board.kernel == "lean" else "",
+        runtime.name(board.system),
+        debian_kernel.PACKER,
+        board.model_dump_json(include={"disk_modules", "architecture", "console"}),
+        json.dumps(privileges.USERS),
+        cache.digest_of(DATA, lists()),
+        *(Path(__file__).parent / name for name in MADE_BY),
+        Path(namespace.__file__),
+        cache.digest_of(paths.OVERLAY, overlay_files()),
+    )
 
 
 def far(log: str, packages: int) -> progress.Far:
@@ -122,9 +128,13 @@ def far(log: str, packages: int) -> progress.Far:
     return progress.Far(sum(_SECONDS[name] for name in ended) + share, sum(_SECONDS.values()), part=part)
 
 
-def _overlay_files() -> list[Path]:
+def overlay_files() -> list[Path]:
     """The overlay's files common to all robots; templates belong to the identity."""
-    return sorted(path for path in paths.OVERLAY.rglob("*") if path.is_file() and path.suffix != ".j2")
+    return [path for path in sources.files(paths.OVERLAY) if path.suffix != ".j2"]
+
+
+def lists() -> list[Path]:
+    return [path for path in sources.files(DATA) if path.suffix == ".list"]
 
 
 # What follows runs in the stage's own namespaces.
@@ -189,7 +199,7 @@ def main(description_file: str) -> None:
         stage.in_target("dpkg", "--install", f"{_REPOSITORY}/{package}")
     with _timed("overlay"):
         _remove_excluded(stage.target)
-        _lay_overlay(stage.target)
+        lay_overlay(stage.target)
         _configure(stage, description["console"])
     with _timed("clean"):
         contents = _clean(stage)
@@ -210,7 +220,7 @@ def main(description_file: str) -> None:
             "env", "-u", "SOURCE_DATE_EPOCH", "mksquashfs", "/target", "/out/root.squashfs", *COMPRESSION,
             "-noappend", "-no-progress", "-exports", "-action-file", "/tmp/actions",
             "-mkfs-time", str(stage.epoch), "-all-time", str(stage.epoch),
-            "-wildcards", "-e", "dev/*", "proc/*", "sys/*", "run/*", "tmp/*", "debootstrap",
+            "-wildcards", "-e", *(f"{name}/*" for name in NOT_PACKED), "debootstrap",
         ]  # fmt: skip
         together.run(*packing, lambda: stage.in_tools(*squash))
     contents |= {"kernel": version, "root_bytes": (out / "root.squashfs").stat().st_size}
@@ -237,13 +247,13 @@ def _bootstrap(stage: Stage, architecture: str, release: str, packages: list[str
 
 def _list(name: str) -> list[str]:
     """The entries of a list file, without comments."""
-    return [entry for line in (_DATA / name).read_text().splitlines() if (entry := line.split("#")[0].strip())]
+    return [entry for line in (DATA / name).read_text().splitlines() if (entry := line.split("#")[0].strip())]
 
 
 def module_patterns(architecture: str) -> list[str]:
     """Which kernel modules to keep: shell patterns over their path below kernel/, without .ko."""
     own = f"modules-{architecture}.list"
-    return _list("modules.list") + (_list(own) if (_DATA / own).is_file() else [])
+    return _list("modules.list") + (_list(own) if (DATA / own).is_file() else [])
 
 
 def path_rules() -> list[tuple[bool, str]]:
@@ -323,16 +333,22 @@ def _prune_modules(stage: Stage, architecture: str) -> str:
     return version
 
 
-def _lay_overlay(target: Path) -> None:
-    for source in _overlay_files():
+def lay_overlay(target: Path) -> None:
+    for source in overlay_files():
         place = target / source.relative_to(paths.OVERLAY)
+        # Nothing is written through a link: an absolute one of the root's would lead to this computer's files.
+        if (leads := place.parent.resolve()) != (there := target.resolve()) and there not in leads.parents:
+            raise SystemExit(
+                f"{paths.shown(source)}: a folder of this path is a link to {leads} in the root; put the file where "
+                "that leads to"
+            )
         place.parent.mkdir(parents=True, exist_ok=True)
+        place.unlink(missing_ok=True)
         if source.is_symlink():
-            place.unlink(missing_ok=True)
             place.symlink_to(source.readlink())
         else:
             place.write_bytes(source.read_bytes())
-            place.chmod(0o755 if os.access(source, os.X_OK) else 0o644)
+            place.chmod(0o755 if sources.executable(source) else 0o644)
 
 
 def _configure(stage: Stage, console: str) -> None:

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from flotilla.common import cache, namespace, paths, progress, together
+from flotilla.common import cache, namespace, paths, progress, sources, together
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import System
-from images.builder import pool, runtime_stage, toolchain, tools
+from images.builder import chroot, pool, runtime_stage, toolchain, tools
 from images.builder.lock import HOST, Lock, read_lock, runtime_lock
 
 SOURCE = paths.PROJECT / "runtime"
@@ -25,6 +25,7 @@ WARNINGS = ("-Wall", "-Wextra", "-Werror")
 """Compiler options for code that is written by hand."""
 _KIND = "runtime"
 """Of results in the cache."""
+MADE_BY = (runtime_stage.__file__, chroot.__file__, namespace.__file__)
 _LEFT_OUT = ("bench", "tests", "tidy.py")
 """Folders of the source that no package comes from."""
 
@@ -58,7 +59,7 @@ def command(work: Path, system: System, argv: Sequence[str], run: toolchain.Run 
 
     There, `work` is /out, and gets the public headers in /out/include. `run` says where that is; so does it below.
     """
-    shutil.copytree(SOURCE / "include", work / "include")
+    copy_sources(work, "include")
     log = paths.BUILD / f"compile-{system.suite}-{system.architecture}.log"
     with cache.locked(log.with_name(f".{log.name}.lock")):  # an error shows what the log ends with
         run(runtime_lock(system), work, argv, log)
@@ -68,7 +69,8 @@ def compile_plugin(
     source: Path, system: System, options: Sequence[str] = WARNINGS, run: toolchain.Run = toolchain.run
 ) -> bytes:
     """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture."""
-    files = sorted(file.name for file in source.glob("*.c")) if source.is_dir() else [source.name]
+    found = sources.files(source) if source.is_dir() else [source]
+    files = [path.name for path in found if path == source or (path.parent == source and path.suffix == ".c")]
     options = ["-std=c11", *options, "-fvisibility=hidden", "-I/out/include"]
     return compile_shared(source, files, system, options, run)
 
@@ -83,7 +85,7 @@ def compile_shared(
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".plugin-") as directory:
         work = Path(directory)
         if source.is_dir():
-            shutil.copytree(source, work / "source")
+            shutil.copytree(source, work / "source", ignore=sources.ignored)
         else:
             (work / "source").mkdir()
             shutil.copy(source, work / "source")
@@ -133,18 +135,28 @@ def _run(system: System, program: str, *arguments: str) -> subprocess.CompletedP
     return subprocess.run([*argv, *arguments], capture_output=True, encoding="utf-8", check=False)
 
 
-def sources() -> list[Path]:
+def source_files() -> list[Path]:
     """The files that decide what the packages hold; those of linters, which are hidden, do not."""
-    return sorted(
-        path for path in SOURCE.rglob("[!.]*") if path.is_file() and path.relative_to(SOURCE).parts[0] not in _LEFT_OUT
-    )
+    found = ((path, path.relative_to(SOURCE).parts) for path in sources.files(SOURCE))
+    return [path for path, parts in found if parts[0] not in _LEFT_OUT and not any(part[0] == "." for part in parts)]
+
+
+def copy_sources(to: Path, part: str = "") -> None:
+    """Copy the files, or those of one folder of them. Links stay links: what one leads to outside is not counted."""
+    for path in source_files():
+        if path.is_relative_to(SOURCE / part):
+            place = to / path.relative_to(SOURCE)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, place, follow_symlinks=False)
 
 
 def key(system: System) -> str:
     """Hash of all that decides the packages' bytes."""
-    made_by = [Path(runtime_stage.__file__), Path(runtime_stage.__file__).with_name("chroot.py")]
-    names = "\n".join(str(path.relative_to(SOURCE)) for path in sources())
-    return cache.digest(read_lock(runtime_lock(system)).digest, names, *sources(), *made_by)
+    lock = read_lock(runtime_lock(system))
+    return cache.digest(
+        tools.name(lock), lock.digest, system.architecture, json.dumps(libraries(system)),
+        cache.digest_of(SOURCE, source_files()), *map(Path, MADE_BY),
+    )  # fmt: skip
 
 
 def build(system: System) -> Runtime:
@@ -157,10 +169,7 @@ def build(system: System) -> Runtime:
     def compile_it(out: Path) -> None:
         pool.fill([lock])
         tree = tools.tree(lock)
-        for path in sources():
-            place = out / "source" / path.relative_to(SOURCE)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, place)
+        copy_sources(out / "source")
         log = paths.BUILD / f"{runtime_lock(system)}.log"
         log.unlink(missing_ok=True)  # an earlier build's
         with progress.step(f"runtime for {system}", lambda: far(progress.text(log))):

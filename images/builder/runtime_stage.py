@@ -27,6 +27,7 @@ def main(tools: str, out: str, architecture: str, epoch: str, depends: str) -> N
     os.umask(0o022)
     chroot = Chroot(Path(tools), int(epoch))
     chroot.environment |= {"CC": "gcc", "LDFLAGS": "-Wl,--build-id=none", "DESTDIR": "/out/installed"}
+    chroot.environment["PYTHONDONTWRITEBYTECODE"] = "1"  # meson's, into the tools, which other builds share
     chroot.provide_system(out=out)
     setup = ["--prefix=/usr", "--libdir=lib", "--buildtype=release", "--strip", "-Ddds=enabled", "-Diidc=enabled"]
     chroot.log("meson", "setup", "/out/objects", "/out/source", *setup)

@@ -16,6 +16,8 @@ from flotilla.common.errors import UserError
 from images.builder import pool
 from images.builder.lock import Lock, Package
 
+_KIND = "tools"
+"""Of results in the cache."""
 _MERGED = ("bin", "sbin", "lib", "lib32", "lib64")
 _LOADERS = {
     "amd64": "usr/lib/x86_64-linux-gnu/ld-linux-x86-64.so.2",
@@ -43,7 +45,16 @@ def tree(lock: Lock) -> Path:
             # What the maintainer scripts would have set up.
             (directory / "usr/bin/awk").symlink_to("mawk")
 
-    return cache.result("tools", cache.digest(lock.digest, Path(__file__)), unpack)
+    return cache.result(_KIND, _key(lock), unpack)
+
+
+def name(lock: Lock) -> str:
+    """Of the directory of what `tree` makes; it need not be made yet."""
+    return cache.name(_KIND, _key(lock))
+
+
+def _key(lock: Lock) -> str:
+    return cache.digest(lock.digest, Path(__file__))
 
 
 def _unpack(package: Package, directory: Path) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from flotilla.apps import assigned
-from flotilla.common import cache, paths
+from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import apps, identity
 from flotilla.fleet.apps import BuiltApp
@@ -63,7 +63,7 @@ def hover(built: Path) -> BuiltApp:
 def test_an_app_is_its_files_however_they_were_made(built: Path, hover: BuiltApp, tmp_path: Path) -> None:
     """Seen to fail with the modes that a umask left."""
     assert hover.files[PurePosixPath("hover")] == (b"program", 0o755)
-    assert hover.listing.decode().splitlines()[0] == f"version {cache.digest(*sorted(built.iterdir()))[:16]}"
+    assert hover.listing.decode().splitlines()[0] == f"version {apps.version(built)}"
     assert "755 " in hover.listing.decode()
     elsewhere = tmp_path / "elsewhere" / "hover"
     elsewhere.parent.mkdir()
@@ -74,6 +74,8 @@ def test_an_app_is_its_files_however_they_were_made(built: Path, hover: BuiltApp
     other = apps.read("hover", elsewhere, "hover")
     assert other.version != hover.version
     assert other.sha256 != hover.sha256
+    (elsewhere / "empty").mkdir()  # seen to be left out of the version, and sent
+    assert apps.version(elsewhere) != other.version
 
 
 def test_a_card_has_its_apps_as_deploy_would_leave_them(fleet: Fleet, hover: BuiltApp) -> None:
