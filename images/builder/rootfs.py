@@ -18,7 +18,7 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from flotilla.common import cache, namespace, paths, progress, sources, together
@@ -203,6 +203,7 @@ def main(description_file: str) -> None:
         _configure(stage, description["console"])
     with _timed("clean"):
         contents = _clean(stage)
+        check_privileged(stage.target, privileged_list(description["release"]))
     packing: list[Callable[[], object]] = []
     if description["disk_modules"] is not None:
         with _timed("initramfs"):
@@ -252,8 +253,18 @@ def _list(name: str) -> list[str]:
 
 def module_patterns(architecture: str) -> list[str]:
     """Which kernel modules to keep: shell patterns over their path below kernel/, without .ko."""
-    own = f"modules-{architecture}.list"
-    return _list("modules.list") + (_list(own) if (DATA / own).is_file() else [])
+    return _list_with_own("modules", architecture)
+
+
+def privileged_list(release: str) -> list[str]:
+    """The files of a root that are privileged, as images/rootfs/privileged.list describes them."""
+    return _list_with_own("privileged", release)
+
+
+def _list_with_own(name: str, of: str) -> list[str]:
+    """What stands in a list for all, and in the one of an architecture or a release, if there is one."""
+    own = f"{name}-{of}.list"
+    return _list(f"{name}.list") + (_list(own) if (DATA / own).is_file() else [])
 
 
 def path_rules() -> list[tuple[bool, str]]:
@@ -394,6 +405,56 @@ def _clean(stage: Stage) -> dict[str, object]:
     for name in ("proc", "sys"):
         subprocess.run(["umount", "-R", str(stage.target / name)], stderr=subprocess.DEVNULL, check=False)
     return {"packages": [line.split() for line in sizes.splitlines()]}
+
+
+_PLAIN = "of root, without special bits and attributes"
+
+
+def check_privileged(target: Path, listed: Iterable[str]) -> None:
+    """SystemExit with the files of a root that are privileged otherwise than the lines `listed` say.
+
+    Maintainer scripts do without a capability that this computer refuses them: without setcap(8), ping is set-user-ID.
+    """
+    wanted = {line.split()[3]: line for line in listed}
+    found = _privileged(target)
+    plain = {path for path in wanted.keys() - found.keys() if os.path.lexists(f"{target}{path}")}
+    problems = [
+        f"{path}: is {found.get(path, _PLAIN)}; listed: {wanted.get(path, 'no')}"
+        for path in sorted(found.keys() | plain)
+        if wanted.get(path) != found.get(path)
+    ]
+    if problems:
+        raise SystemExit(
+            "\n".join(problems)
+            + "\nthe root has other privileged files than images/rootfs/privileged.list; correct that list where they "
+            "are meant; otherwise this computer refused what makes them so (capabilities, extended attributes in tmpfs)"
+        )
+
+
+def _privileged(target: Path) -> dict[str, str]:
+    """By path, as a line of privileged.list."""
+    users, groups = (
+        {fields[2]: fields[0] for line in (target / name).read_text().splitlines() if (fields := line.split(":"))}
+        for name in ("etc/passwd", "etc/group")
+    )
+    found = {}
+    for parent, directories, names in os.walk(target):
+        if parent in (f"{target}/{name}" for name in NOT_PACKED):
+            directories.clear()
+            continue
+        for path in (f"{parent}/{name}" for name in directories + names):
+            status = os.lstat(path)
+            special = status.st_mode & 0o7000 and not stat.S_ISLNK(status.st_mode)
+            attributes = sorted(os.listxattr(path, follow_symlinks=False))
+            if special or status.st_uid or status.st_gid or attributes:
+                owner, group = (
+                    users.get(str(status.st_uid), status.st_uid),
+                    groups.get(str(status.st_gid), status.st_gid),
+                )
+                words = [f"{stat.S_IMODE(status.st_mode):04o}", str(owner), str(group), path.removeprefix(str(target))]
+                words += [f"{name}=0x{os.getxattr(path, name, follow_symlinks=False).hex()}" for name in attributes]
+                found[words[3]] = " ".join(words)
+    return found
 
 
 def _settle_times(stage: Stage) -> None:
