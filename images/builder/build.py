@@ -136,10 +136,10 @@ class _Common:
     """SHA-256 up to the data partition, to be gone on with from a copy."""
     ranges: Future[bmap.BlockMap]
     inputs: Future[str]
-    source: Future[manifest.Source | None]
+    source: Future[manifest.Source | str]
 
     @classmethod
-    def of(cls, made: BoardBuild, source: Future[manifest.Source | None], threads: ThreadPoolExecutor) -> _Common:
+    def of(cls, made: BoardBuild, source: Future[manifest.Source | str], threads: ThreadPoolExecutor) -> _Common:
         image = made.base / "card.img"
         return cls(
             threads.submit(manifest.hash_range, image, 0, card.DATA.start),
@@ -173,6 +173,8 @@ def _robot_images(
         for number, one in enumerate(coming):
             step.at(number, count, "cards")
             said.append(one.result())
+    if isinstance(unknown := source.result(), str):
+        said.append(f"the manifests name no commit: {unknown}")
     print("\n".join(said))
     return [image_of(robot, directory) for robot in robots]
 

@@ -22,7 +22,7 @@ from urllib.parse import quote
 
 from pydantic import BaseModel, ConfigDict, JsonValue
 
-from flotilla.common import cache, paths
+from flotilla.common import cache, paths, sources
 from flotilla.common.errors import UserError
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Board, Fleet, Robot
@@ -38,6 +38,13 @@ SBOMS = ("spdx.json", "cdx.json")
 _BOOT_LOADER = "grub-pc-bin"
 """Of the build tools: its code is on the card, before the first partition."""
 _DPKG_STATUS = "var/lib/dpkg/status"
+_ENTERING = (
+    "ansible/control_tasks", "ansible/inventory", "apps", "flotilla", "images", "kernel", "rootfs_overlay", "runtime",
+)  # fmt: skip
+"""Folders of the project whose files images are made of, or by."""
+_SUBMODULE = "160000"
+_SHA1 = 40
+"""Digits of git's names of objects, where it names them by SHA-1."""
 _CHUNK = 1 << 20
 """Bytes hashed at a time."""
 
@@ -110,7 +117,7 @@ class Source(_Model):
 
     commit: str
     dirty: bool
-    """Whether files differed from the commit."""
+    """Whether files differed from the commit, or others were among those that images are made of."""
 
 
 class RobotId(_Model):
@@ -141,7 +148,9 @@ class Manifest(_Model):
     inputs: str
     """SHA-256 over all that goes into the image. Equal inputs: equal image."""
     source: Source | None
-    """None where there is no git."""
+    """None where nobody knows."""
+    source_unknown: str = ""
+    """Why."""
     image: Part
     parts: list[Part]
     partitions: list[Partition]
@@ -388,7 +397,7 @@ def write(
     board_inputs: str,
     nodes: list[Node],
     apps: Sequence[BuiltApp],
-    source: Source | None,
+    source: Source | str,
     data: Part,
     image: Part,
     extents: card.Extents,
@@ -397,7 +406,7 @@ def write(
     """Write the manifest and the bills of materials of `beside`, an image of which everything is known.
 
     `locks`: the board's and the build tools'. `common`: what `shared` made. `board_inputs`: what `inputs_of_board`
-    said.
+    said. `source`: what `checkout` said.
     """
     board = fleet.boards[robot.board]
     lock, tools_lock = locks
@@ -411,7 +420,8 @@ def write(
         tools=_lock_id(tools_lock),
         epoch=lock.epoch,
         inputs=inputs(board_inputs, nodes),
-        source=source,
+        source=None if isinstance(source, str) else source,
+        source_unknown=source if isinstance(source, str) else "",
         image=image,
         parts=[*same.parts, data],
         partitions=partitions(board, extents),
@@ -514,23 +524,66 @@ def hostvars(fleet: Fleet, robot: Robot) -> dict[str, JsonValue]:
     return own | shared
 
 
-def checkout(directory: Path = paths.PROJECT) -> Source | None:
-    """Commit and cleanliness of the checkout that `directory` is the top of; None without git, or outside of it."""
+def checkout(directory: Path = paths.PROJECT) -> Source | str:
+    """Commit and cleanliness of the checkout that `directory` is the top of; why they are unknown otherwise.
+
+    Another user may own the checkout. So no command of git's reads more than its objects: the others run programs that
+    the repository's configuration names (core.fsmonitor, filters). And git would leave out what it was told to ignore,
+    and is in the image all the same.
+    """
     try:
-        top, commit = _git(directory, "rev-parse", "--show-toplevel", "HEAD").splitlines()
+        top, commit = _git(directory, "rev-parse", "--show-toplevel", "HEAD").decode().splitlines()
         if Path(top).resolve() != directory.resolve():  # unpacked inside somebody else's repository
-            return None
-        return Source(commit=commit, dirty=bool(_git(directory, "status", "--porcelain")))
-    except (OSError, ValueError, subprocess.CalledProcessError):
-        return None
+            return f"{directory} is not the top of a git checkout"
+        return Source(commit=commit, dirty=_differs(directory, commit))
+    except subprocess.CalledProcessError as error:
+        return error.stderr.decode(errors="replace").strip().partition("\n")[0] or f"git failed ({error.returncode})"
+    except (OSError, ValueError) as error:
+        return str(error)
 
 
-def _git(directory: Path, *arguments: str) -> str:
-    # Nothing may be written: another user may own the checkout, and another git may be at work in it.
+def _differs(directory: Path, commit: str) -> bool:
+    """Whether the files of a checkout are others than those of the commit."""
+    committed = _committed(directory, commit)
+    if any(_blob(path, identity) != (mode, identity) for path, (mode, identity) in committed.items()):
+        return True
+    entering = (directory / name for name in _ENTERING)
+    return any(path not in committed for each in entering if each.is_dir() for path in sources.files(each))
+
+
+def _committed(directory: Path, commit: str) -> dict[Path, tuple[str, str]]:
+    """Mode and identity of each file of a commit, those of submodules included. Format: git-ls-tree(1)."""
+    found = {}
+    for entry in _git(directory, "ls-tree", "-rz", "--full-tree", commit).split(b"\0")[:-1]:
+        properties, _, name = entry.partition(b"\t")
+        mode, _, identity = properties.decode().split()
+        path = directory / os.fsdecode(name)
+        if mode != _SUBMODULE:
+            found[path] = mode, identity
+        elif (path / ".git").exists():  # otherwise nobody asked for it
+            found |= _committed(path, identity)
+    return found
+
+
+def _blob(path: Path, like: str) -> tuple[str, str]:
+    """Mode and identity that git gives a file; hashed as the identity `like` is."""
+    if path.is_symlink():
+        mode, content = "120000", os.fsencode(path.readlink())
+    elif path.is_file():
+        mode, content = "100755" if sources.executable(path) else "100644", path.read_bytes()
+    else:
+        return "", ""
+    algorithm = "sha1" if len(like) == _SHA1 else "sha256"
+    return mode, hashlib.new(algorithm, b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+
+
+def _git(directory: Path, *arguments: str) -> bytes:
+    # The directory's owner gains nothing by being trusted: whoever builds here runs the owner's programs anyway.
+    argv = ["git", "-c", f"safe.directory={directory.resolve()}", "-C", str(directory), *arguments]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
-    argv = ["git", "-C", str(directory), *arguments]
-    environment |= {"GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C.UTF-8"}
-    return subprocess.run(argv, env=environment, capture_output=True, text=True, check=True).stdout
+    # Objects that a partial clone has not are not fetched: the repository says by which program.
+    environment |= {"GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "none", "LC_ALL": "C.UTF-8"}
+    return subprocess.run(argv, env=environment, capture_output=True, check=True).stdout
 
 
 def _lock_id(lock: Lock) -> LockId:

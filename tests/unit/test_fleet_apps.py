@@ -168,7 +168,7 @@ def test_manifest_and_bills_name_the_apps(fleet: Fleet, hover: BuiltApp, tmp_pat
     part = manifest.Part(name="some", bytes=1, sha256="0")
     manifest.write(
         fleet, fleet.robots[4], (read_lock("smartcoret3"), read_lock("tools")), tmp_path, board_inputs="0", nodes=[],
-        apps=[hover], source=None, data=part, image=part, extents=[], beside=image,
+        apps=[hover], source="no git", data=part, image=part, extents=[], beside=image,
     )  # fmt: skip
     (told,) = manifest.read(image, "make image").apps
     assert (told.name, told.version, told.sha256) == ("hover", hover.version, hover.sha256)

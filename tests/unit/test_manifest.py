@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import subprocess
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
+from shutil import which
 from types import SimpleNamespace
 
 import pytest
@@ -238,9 +241,9 @@ def test_checkout(tmp_path: Path) -> None:
     project = tmp_path / "project"
     project.mkdir()
     (project / "file").write_text("1")
-    assert manifest.checkout(project) is None
+    assert "not a git repository" in str(manifest.checkout(project))
     git(project, "init", "-q")
-    assert manifest.checkout(project) is None, "no commit yet"
+    assert "HEAD" in str(manifest.checkout(project)), "no commit yet"
     git(project, "add", "file")
     git(project, "commit", "-qm", "first")
     clean = manifest.checkout(project)
@@ -249,12 +252,103 @@ def test_checkout(tmp_path: Path) -> None:
     dirty = manifest.checkout(project)
     assert dirty == manifest.Source(commit=clean.commit, dirty=True)
     (project / "inside").mkdir()
-    assert manifest.checkout(project / "inside") is None, "another project's repository"
+    assert "is not the top of a git checkout" in str(manifest.checkout(project / "inside")), "another's repository"
 
 
-def test_no_git_no_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def committed(project: Path) -> manifest.Source:
+    """A checkout with a file, a program and a link; its source."""
+    overlay = project / "rootfs_overlay"
+    overlay.mkdir(parents=True)
+    (overlay / "file").write_text("1")
+    (overlay / "program").touch(0o755)
+    (overlay / "link").symlink_to("/nowhere")
+    git(project, "init", "-q")
+    git(project, "add", ".")
+    git(project, "commit", "-qm", "first")
+    source = manifest.checkout(project)
+    assert source == manifest.Source(commit=git(project, "rev-parse", "HEAD"), dirty=False)
+    return source
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "content": lambda overlay: (overlay / "file").write_text("2"),
+    "mode": lambda overlay: (overlay / "file").chmod(0o755),
+    "link": lambda overlay: (overlay / "link").rename(overlay / "file"),
+    "missing": lambda overlay: (overlay / "file").unlink(),
+    "untracked": lambda overlay: (overlay / "new").touch(),
+    "ignored": lambda overlay: (overlay / "new.local").touch(),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_checkout_is_dirty_by_what_an_image_gets(tmp_path: Path, change: str) -> None:
+    """Whatever git was told: seen to be called clean were a file that git ignores, an untracked one with
+    status.showUntrackedFiles=no, a mode with core.fileMode=false, and content that is assumed to be unchanged."""
+    source = committed(tmp_path)
+    git(tmp_path, "config", "status.showUntrackedFiles", "no")
+    git(tmp_path, "config", "core.fileMode", "false")
+    git(tmp_path, "update-index", "--assume-unchanged", "rootfs_overlay/file")
+    (tmp_path / ".git/info/exclude").write_text("*.local\n")
+    CHANGES[change](tmp_path / "rootfs_overlay")
+    assert manifest.checkout(tmp_path) == manifest.Source(commit=source.commit, dirty=True)
+
+
+def test_what_enters_no_image_makes_no_checkout_dirty(tmp_path: Path) -> None:
+    source = committed(tmp_path)
+    (tmp_path / "rootfs_overlay/__pycache__").mkdir()
+    (tmp_path / "rootfs_overlay/__pycache__/a.pyc").touch()
+    (tmp_path / "rootfs_overlay/file~").touch()
+    (tmp_path / "notes").touch()
+    assert manifest.checkout(tmp_path) == source
+
+
+def test_a_submodule_is_a_part_of_the_checkout(tmp_path: Path) -> None:
+    project, one = tmp_path / "project", tmp_path / "one"
+    committed(one)
+    committed(project)
+    git(project, "-c", "protocol.file.allow=always", "submodule", "add", "-q", str(one), "apps/one")
+    git(project, "commit", "-qm", "second")
+    clean = manifest.checkout(project)
+    assert clean == manifest.Source(commit=git(project, "rev-parse", "HEAD"), dirty=False)
+    (project / "apps/one/rootfs_overlay/file").write_text("2")
+    assert manifest.checkout(project) == manifest.Source(commit=clean.commit, dirty=True)
+    git(project, "submodule", "deinit", "-f", "apps/one")
+    assert manifest.checkout(project) == clean
+
+
+def test_the_commit_of_anothers_checkout_is_known_and_runs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seen to fail: the manifest had no commit. `git status` ran the filter and what core.fsmonitor names."""
+    project, ran = tmp_path / "project", tmp_path / "ran"
+    source = committed(project)
+    program = tmp_path / "program"
+    program.write_text(f'#!/bin/sh\necho "$0" >>"{ran}"\n')
+    program.chmod(0o755)
+    for key in ("core.fsmonitor", "filter.own.clean", "filter.own.process", "core.sshCommand", "core.pager"):
+        git(project, "config", key, str(program))
+    git(project, "config", "core.hooksPath", str(tmp_path / "hooks"))
+    (tmp_path / "hooks").mkdir()
+    (tmp_path / "hooks/post-index-change").symlink_to(program)
+    (project / ".git/info/attributes").write_text("* filter=own\n")
+    os.utime(project / "rootfs_overlay/file")
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/git").write_text(f'#!/bin/sh\nGIT_TEST_ASSUME_DIFFERENT_OWNER=1 exec {which("git")} "$@"\n')
+    (tmp_path / "bin/git").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    refused = subprocess.run(["git", "-C", project, "status"], capture_output=True, text=True, check=False)
+    assert "dubious ownership" in refused.stderr
+    assert manifest.checkout(project) == source
+    assert not ran.exists(), ran.read_text()
+
+
+def test_without_git_the_manifest_says_so(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert manifest.checkout() is None
+    why = manifest.checkout()
+    assert isinstance(why, str)
+    assert "'git'" in why
+    made = manifest.read(written(fleet, tmp_path / "made", source=why), "make image")
+    assert (made.source, made.source_unknown) == (None, why)
 
 
 # --- the whole ---
@@ -270,7 +364,7 @@ EXTENTS = [
 
 
 def written(
-    fleet: Fleet, directory: Path, number: int = 3, source: manifest.Source | None = None, lock: Lock | None = None
+    fleet: Fleet, directory: Path, number: int = 3, source: manifest.Source | str = "", lock: Lock | None = None
 ) -> Path:
     common = directory / "common"
     common.mkdir(parents=True)
