@@ -11,9 +11,7 @@ import stat
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import IO
 
 _MAGIC = 0xEF53
 _KNOWN = 0x2 | 0x40 | 0x80 | 0x200
@@ -49,9 +47,8 @@ class Found:
 class Reader:
     """The file system that lies `start` bytes behind the beginning of `image`."""
 
-    def __init__(self, image: Path, start: int = 0) -> None:
-        # Read, not mapped: a page of a hole that is mapped takes memory of a tmpfs, and there may be none left.
-        self._image = image.open("rb", buffering=0)
+    def __init__(self, image: IO[bytes], start: int = 0) -> None:
+        self._image = image
         self._start = start
         block = self._at(1024, 1024)
         if struct.unpack_from("<H", block, 56)[0] != _MAGIC:
@@ -71,24 +68,22 @@ class Reader:
             for group in range(groups)
         ]
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._image.close()
-
     def walk(self) -> Iterator[tuple[bytes, Found]]:
         """Every path below the root, parents first, with what it leads to."""
-        waiting = [(b"", _ROOT)]
+        waiting, seen = [(b"", _ROOT)], {_ROOT}
         while waiting:
             place, number = waiting.pop()
             for name, inode in self._names(self._content(self._inode(number))):
                 path, found = place + b"/" + name, self._found(self._inode(inode))
                 yield path, found
                 if stat.S_ISDIR(found.mode):
+                    if inode in seen:
+                        raise Unreadable("it has a directory in two places")
+                    seen.add(inode)
                     waiting.append((path, inode))
 
     def _at(self, offset: int, length: int) -> bytes:
+        # Read, not mapped: a page of a hole that is mapped takes memory of a tmpfs, and there may be none left.
         found = os.pread(self._image.fileno(), length, self._start + offset)
         if len(found) != length:
             raise Unreadable(f"it ends before byte {offset + length}")

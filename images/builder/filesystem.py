@@ -131,15 +131,19 @@ def _mode(node: Node) -> int:
 def _compare(nodes: Sequence[Node], image: Path, start: int, what: str, epoch: int) -> None:
     """UserError where the file system does not hold these nodes, or more."""
     wanted = {str(node.path).encode(): node for node in nodes}
-    wrong = []
-    with extfs.Reader(image, start) as reader:
-        full = not reader.free_blocks or not reader.free_inodes
-        for path, found in reader.walk():
-            node = wanted.pop(path, None)
-            if node:
-                wrong += [f"{node.path}: {difference}" for difference in _differences(node, found, epoch)]
-            elif path != b"/lost+found":
-                wrong.append(f"{os.fsdecode(path)}: should not be there")
+    wrong, full = [], False
+    try:
+        with image.open("rb") as file:
+            reader = extfs.Reader(file, start)
+            full = not reader.free_blocks or not reader.free_inodes
+            for path, found in reader.walk():
+                node = wanted.pop(path, None)
+                if node:
+                    wrong += [f"{node.path}: {difference}" for difference in _differences(node, found, epoch)]
+                elif path != b"/lost+found":
+                    wrong.append(f"{os.fsdecode(path)}: should not be there")
+    except extfs.Unreadable as error:
+        wrong.append(str(error))
     wrong += [f"{node.path}: is missing" for node in wanted.values()]
     if not wrong:
         return

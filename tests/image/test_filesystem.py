@@ -108,6 +108,8 @@ FAULTS = {
     "nanoseconds": ('("./net" ctime_extra) 0', r"\1 4", r"/a/net: has times .*, 1700000000000000001, 17"),
     "truncated": (r"\Z", 'sif "/a/keys" size 5\n', "/a/keys: has another content .5 bytes, not the 12000"),
     "hole": (r"\Z", 'clri "/a/keys"\n', "/a/keys: has another content"),
+    "damage": (r"\Z", "zap_block -f /a 0\n", "it has a damaged directory; /a/keys: is missing"),
+    "loop": (r"\Z", 'link "/a" "/a/b"\n', "it has a directory in two places"),
     "more": (r"\Z", 'mkdir "/a/more"\n', "/a/more: should not be there"),
 }  # fmt: skip
 """What goes wrong in debugfs, as a change of its script, and what is said of it."""
