@@ -272,14 +272,17 @@ class _Call:
         received = self._directory / f"{file.name}.FAILED"
         if kind is WRONG and received.is_file():
             with received.open("rb") as content:
-                if _PAGE.match(content.read(512)):
-                    kind = PAGE
-            reason = (
-                f"has SHA-256 {_sha256(received)} and {received.stat().st_size} bytes, the lock says {file.sha256} and "
-                f"{file.size} bytes"
-            )
+                page = _PAGE.match(content.read(512))
+            kind, reason = (PAGE, "has a page of HTML") if page else (kind, _difference(file, received))
         received.unlink(missing_ok=True)
         self.failures[file] = kind, reason
+
+
+def _difference(file: File, received: Path) -> str:
+    return (
+        f"has SHA-256 {_sha256(received)} and {received.stat().st_size} bytes, the lock says {file.sha256} and "
+        f"{file.size} bytes"
+    )
 
 
 def _options(patient: bool) -> list[str]:

@@ -189,7 +189,7 @@ def _reasons(failed: Mapping[Package, Failure], mirrors: Mirrors) -> Iterator[st
             alike[failure.host, failure.kind].append(package)
     for packages in alike.values():
         failure = failed[packages[0]]
-        others = f" and {len(packages) - 1} others" if packages[1:] else ""
+        others = f" and {len(packages) - 1} more" if packages[1:] else ""
         yield f"package {packages[0]}{others}: {failure.address}: {failure.reason}; {failure.kind.remedy}"
 
 

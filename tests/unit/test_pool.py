@@ -94,7 +94,7 @@ def test_full_pool_needs_neither_mirror_nor_network(server: FaultServer, monkeyp
     assert len(server.requests) == 3
 
     pool.file(ONE).unlink()
-    with pytest.raises(UserError, match="set MIRROR"):
+    with pytest.raises(UserError, match="command MIRROR"):
         pool.fill([LOCK])
 
 
@@ -146,7 +146,7 @@ def test_damaged_package_without_a_mirror(server: FaultServer, monkeypatch: pyte
     pool.fill([LOCK], server.mirrors)
     damage(ONE, b"x" * ONE.size)
     monkeypatch.setattr(mirror, "resolve", lambda: Mirrors())
-    with pytest.raises(UserError, match="set MIRROR"):
+    with pytest.raises(UserError, match="command MIRROR"):
         pool.verify_hashes(LOCK)
 
 
@@ -216,7 +216,7 @@ def test_passing_failures_are_tried_again(server: FaultServer, answer: Answer, w
 
 def test_waits_grow_up_to_a_bound(server: FaultServer, waits: list[float]) -> None:
     server.fault = lambda path, number: Answer(503)
-    with pytest.raises(UserError, match=r"^package one .* and 2 others: .*503.*MIRROR="):
+    with pytest.raises(UserError, match=r"^package one .* and 2 more: .*503.*MIRROR="):
         pool.fill([LOCK], server.mirrors)
     assert len(waits) == len(download._DELAYS_S)
     assert all(0.75 * delay <= wait <= 1.25 * delay for delay, wait in zip(download._DELAYS_S, waits, strict=True))
@@ -274,7 +274,7 @@ def test_host_that_refuses_connections_is_given_up_as_a_whole(server: FaultServe
     with pytest.raises(UserError) as caught:
         pool.fill([LOCK], mirrors)
     (line,) = str(caught.value).splitlines()
-    assert line.startswith("package one 1.0 (i386) and 2 others: http://127.0.0.1:")
+    assert line.startswith("package one 1.0 (i386) and 2 more: http://127.0.0.1:")
     assert "connect" in line
     assert "Acquire::http::Proxy" in line
     assert "MIRROR=" in line
@@ -375,7 +375,7 @@ def test_proxy_that_cannot_be_reached(
     server: FaultServer, apt_settings: Callable[..., None], waits: list[float]
 ) -> None:
     apt_settings('Acquire::http::Proxy "http://127.0.0.1:1";')
-    with pytest.raises(UserError, match=r"^package one .* and 2 others: .*127\.0\.0\.1:1.*Acquire::http::Proxy"):
+    with pytest.raises(UserError, match=r"^package one .* and 2 more: .*127\.0\.0\.1:1.*Acquire::http::Proxy"):
         pool.fill([LOCK], server.mirrors)
 
 
@@ -398,7 +398,7 @@ def test_certificate_that_nobody_knows(
     inspected: FaultServer, apt_settings: Callable[..., None], waits: list[float]
 ) -> None:
     apt_settings()
-    with pytest.raises(UserError, match=r"and 2 others: https://.*[Cc]ertificate.*update-ca-certificates"):
+    with pytest.raises(UserError, match=r"and 2 more: https://.*[Cc]ertificate.*update-ca-certificates"):
         pool.fill([LOCK], inspected.mirrors)
 
 
