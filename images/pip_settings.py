@@ -37,7 +37,7 @@ _SECTIONS = ("global", "install", ":env:")
 _SYSTEM_CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 _CERTIFICATES = ("REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE", "SSL_CERT_FILE")
 """Variables that name certificates. pip knows the first two, uv the last."""
-_PATIENCE = {"retries": ("PIP_RETRIES", "3"), "timeout": ("PIP_DEFAULT_TIMEOUT", "10")}
+_PATIENCE = {"retries": ("PIP_RETRIES", "2"), "timeout": ("PIP_DEFAULT_TIMEOUT", "10")}
 """Where nothing else is set: some 40 s behind a firewall that answers nothing; pip alone takes twice that or more."""
 _REMEDY = (
     "check the network (a captive portal, a firewall?); another index is set by PIP_INDEX_URL= or in pip.conf, a proxy "
@@ -81,7 +81,9 @@ def reason(output: str) -> str:
     """What kept pip or uv from an index, in its own words."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     causes = [line for line in lines if line.startswith("cause: ")][-1:]  # uv's last one is the first cause
-    broken = [re.sub(r".*(0x\w+>: |broken by ')|'?\)*'?: /\S*$", "", line) for line in lines if "broken by '" in line]
+    broken = [
+        re.sub(r".*(0x\w+>[:,] '?|broken by ')|'?\)*'?: /\S*$", "", line) for line in lines if "broken by '" in line
+    ]
     errors = [line for line in lines if line.startswith(("ERROR: ", "error: "))]
     return re.sub(r"^(ERROR|error|cause): ", "", next(iter(causes + broken + errors + lines), "no reason given"))
 
