@@ -16,9 +16,9 @@ FLOTILLA := $(PYTHON) -m flotilla
 # A part of a command: a line that moves on a terminal, a line at its end without one; what it says when it fails.
 step = $(PYTHON) -m flotilla.common.progress
 Q := $(if $(filter-out 0,$(V)),,@)
-export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS
-# Python's programs read and write files in UTF-8, whatever the user's locale.
-export PYTHONUTF8 := 1
+export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS PYTHON3
+# Python imports no packages of the user's, and pip puts none among them.
+unexport PYTHONHOME PYTHONPATH PIP_PREFIX PIP_TARGET PIP_USER
 MAKEFLAGS += --no-print-directory
 .DEFAULT_GOAL := help
 
@@ -222,8 +222,7 @@ coverage: export COVERAGE_FILE = $(covered)/.coverage
 coverage: | setup-tests ## branches of Python and C that unit and runtime tests take, in build/reports/coverage
 	$(Q)mkdir -p $(covered) $(coverage_report)/c; ln -sfn ../cache ../pool ../venv $(covered)
 	$(Q)find $(covered) -name '*.gcda' -delete; rm -f $(COVERAGE_FILE)*
-	$(Q)test -f $(covered)/runtime/build.ninja || $(meson) setup $(covered)/runtime runtime -Dtests=true \
-	    -Db_coverage=true -Dbuildtype=debug $(uncounted_warnings) >/dev/null
+	$(Q)set -e; $(call configured,$(covered)/runtime,,-Dtests=true -Db_coverage=true -Dbuildtype=debug $(uncounted_warnings))
 	$(Q)$(call compile,$(covered)/runtime)
 	@# What was taken is said of a red run, too.
 	$(Q)$(meson) test -C $(covered)/runtime --no-rebuild --print-errorlogs --quiet; echo $$? >$(covered)/status
@@ -245,25 +244,27 @@ bench: | setup-tests ## wall times and ratios against other builders
 ##@ Runtime
 .PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive positions fetch convert report
 meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
+# A directory of meson's names the place of its sources: in a checkout that was moved it is made anew.
+configured = { test -f $1/build.ninja && test "$$(cat $1/.place 2>&1)" = "$$(pwd -P)"; } || \
+    { rm -rf $1; $2 $(meson) setup $1 runtime $3 >/dev/null; pwd -P >$1/.place; }
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
 runtime: | setup-tests ## the runtime's programs for this computer, in build/runtime
 	@# One after the other: processes that run tests ask for it at once.
-	$(Q)mkdir -p $(BUILD); flock $(BUILD)/.runtime.lock sh -e -c $(call quoted,test -f $(BUILD)/runtime/build.ninja || \
-	    $(meson) setup $(BUILD)/runtime runtime >/dev/null; $(call compile,$(BUILD)/runtime))
+	$(Q)mkdir -p $(BUILD); flock $(BUILD)/.runtime.lock sh -e -c $(call quoted,$(call \
+	    configured,$(BUILD)/runtime); $(call compile,$(BUILD)/runtime))
 
 check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
 	$(Q)$(step) "format of C" $(VENV)/bin/clang-format --dry-run -Werror $$(git ls-files '*.[ch]')
-	$(Q)test -f $(BUILD)/runtime-sanitized/build.ninja || $(meson) setup $(BUILD)/runtime-sanitized runtime -Dtests=true \
-	    -Db_sanitize=address,undefined -Dbuildtype=debugoptimized >/dev/null
+	$(Q)set -e; $(call configured,$(BUILD)/runtime-sanitized,,-Dtests=true \
+	    -Db_sanitize=address$(comma)undefined -Dbuildtype=debugoptimized)
 	$(Q)$(step) "compilation with sanitizers" env $(meson) compile -C $(BUILD)/runtime-sanitized
 	$(Q)$(step) "clang-tidy" $(PYTHON) -m runtime.tidy $(BUILD)/runtime-sanitized
 	$(Q)$(step) "unit tests of C" env $(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
 fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60 SEED=]; finds go to build/found
 	$(Q)images/install-host-packages tests/fuzz-packages.txt
-	$(Q)test -f $(BUILD)/fuzz/build.ninja || CC=clang $(meson) setup $(BUILD)/fuzz runtime -Dtests=true -Dfuzz=true \
-	    -Dbuildtype=debugoptimized >/dev/null
+	$(Q)set -e; $(call configured,$(BUILD)/fuzz,CC=clang,-Dtests=true -Dfuzz=true -Dbuildtype=debugoptimized)
 	$(Q)$(call compile,$(BUILD)/fuzz,fuzzers)
 	$(Q)$(meson) test -C $(BUILD)/fuzz --suite fuzz --no-rebuild --print-errorlogs --quiet
 	$(Q)set -e; for known in runtime/tests/fuzz/corpus/*; do \
@@ -345,26 +346,44 @@ scenarios-accept: | setup-tests ## make a new run the accepted one: commit lab/s
 .PHONY: setup setup-tests clean help
 setup: $(VENV)/.installed ## install what building needs
 
-# Ansible's plugins and the command `flotilla` find the packages of this checkout.
+# Git may have been told to end lines with CR LF, or a program that unpacked an archive; shells take none of these.
+$(if $(shell grep -l "$$(printf '\r')" images/install-host-packages Makefile),$(error the files of this checkout end their \
+    lines with CR LF; take a new clone of the repository, or unpack the archive without a conversion of texts))
+
+# One make at a time sets the environment up.
+alone = mkdir -p $(BUILD); exec 9>$(BUILD)/.venv.lock; \
+    flock -n 9 || { echo "$(VENV): another make sets it up; waiting for that" >&2; flock 9; }
+
+# Ansible's plugins and the command `flotilla` find the packages of this checkout: of another place's they know nothing.
+ifneq ($(file <$(VENV)/.installed),$(shell pwd -P))
+.PHONY: $(VENV)/.installed
+endif
 $(VENV)/.installed: $(VENV)/.complete pyproject.toml
-	$(Q)$(VENV)/bin/pip install --quiet --no-index --no-deps --no-build-isolation --editable .
-	$(Q)sync -f $(VENV) && touch $@
+	$(Q)set -e; $(alone); \
+	    $(VENV)/bin/pip install --quiet --no-index --no-deps --no-build-isolation --editable .; sync -f $(VENV); pwd -P >$@
 
 setup-tests: setup ## install what testing needs
 	$(Q)images/install-host-packages tests/host-packages.txt
 
 # pip brings uv alone: that installs all others in a quarter of pip's time.
-new_venv = python3 -m venv $(VENV); sed -n '/^uv==/,/[^\\]$$/p' requirements.lock >$(VENV)/uv.lock; \
+new_venv = "$$python" -m venv "$$(cd $(BUILD) && pwd -P)/venv"; \
+    sed -n '/^uv==/,/[^\\]$$/p' requirements.lock >$(VENV)/uv.lock; \
     $(by_pip_settings) $(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r $(VENV)/uv.lock; \
     $(uv_install) --only-binary :all: -r requirements.lock; \
     $(uv_install) --no-deps --no-build-isolation -r requirements-source.lock
 by_pip_settings = $(PYTHON) images/pip_settings.py
 uv_install = $(by_pip_settings) $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes
-$(VENV)/.complete: requirements.lock requirements-source.lock images/host-packages.txt
+locked_by = requirements.lock requirements-source.lock images/host-packages.txt
+.PHONY: unusable
+$(VENV)/.complete: $(locked_by) $(if $(shell images/environment-state $(VENV)),unusable)
 	$(Q)images/check-host
+	$(Q)images/find-python --before-packages >/dev/null
 	$(Q)images/install-host-packages images/host-packages.txt
 	@# The last good one comes back where the new one fails. It cannot be made beside: its programs name its place.
-	$(Q)set -e; test ! -e $@ || { rm -rf $(VENV).before; mv $(VENV) $(VENV).before; }; \
+	$(Q)set -e; $(alone); why=$$(images/environment-state $(VENV)); \
+	    test ! -e $@ -o -n "$$why" -o -n "$$(find $(locked_by) -newer $@ 2>&1)" || exit 0; \
+	    test -z "$$why" || echo "$(VENV) $$why: it is made anew" >&2; python=$$(images/find-python); \
+	    test ! -e $@ || { rm -rf $(VENV).before; mv $(VENV) $(VENV).before; }; \
 	    trap 'test -e $@ || test ! -e $(VENV).before || { rm -rf $(VENV); mv $(VENV).before $(VENV); }' EXIT; \
 	    trap 'exit 1' HUP INT TERM; \
 	    rm -rf $(VENV); $(new_venv); sync -f $(VENV); touch $@; rm -rf $(VENV).before
@@ -384,8 +403,10 @@ help: ## this list
 ##= KEYS=             where keys are instead of ansible/keys/
 ##= APPS=             where apps are instead of apps/
 ##= ANY_HOST=1        set up a computer that is none of the supported hosts
+##= PYTHON3=          the Python that builds, instead of python3 of the path or of the system
 ##= V=1               show the commands
 
+comma := ,
 # What somebody gave reaches a program as it stands, as one word or as several: no shell reads it as a command.
 quoted = '$(subst ','\'',$1)'
 given = $(call quoted,$(value $1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
@@ -195,7 +196,7 @@ def test_an_environment_that_cannot_be_made_leaves_the_last_one(tmp_path: Path, 
     (last / "marker").touch()
     (last / ".complete").touch()
     os.utime(last / ".complete", (0, 0))  # older than the locks
-    half = f"#!/bin/sh\nmkdir {last}\n"
+    half = f'#!/bin/sh\ncase $1 in -m) ;; *) exec {sys.executable} "$@" ;; esac\nmkdir {last}\n'
     (programs / "python3").write_text(half + ("kill -INT $PPID" if interrupted else "exit 1"))
     (programs / "python3").chmod(0o755)
     environment = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}
@@ -217,3 +218,147 @@ def test_commands_run_in_utf_8_whatever_the_users_locale_is() -> None:
         argv, cwd=paths.PROJECT, env=os.environ | {"LC_ALL": "C"}, capture_output=True, text=True, check=True
     )
     assert done.stdout == "UTF-8\n"
+
+
+def checkout(directory: Path) -> Path:
+    """What `make setup` reads, with an environment that was made there by a Python that is still there."""
+    for name in ("Makefile", "images", "pyproject.toml", "requirements.lock", "requirements-source.lock"):
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        (directory / name).symlink_to(paths.PROJECT / name)
+    programs = directory / "build" / "venv" / "bin"
+    programs.mkdir(parents=True)
+    real = Path(sys.executable).resolve()
+    (programs / "python3").symlink_to(real)
+    (programs.parent / "lib" / real.name).mkdir(parents=True)
+    (programs.parent / "pyvenv.cfg").write_text(f"command = {real} -m venv {programs.parent}\n")
+    (programs / "pip").write_text("#!/bin/sh\nexit 0\n")
+    (programs / "pip").chmod(0o755)
+    (programs.parent / ".complete").touch()
+    (programs.parent / ".installed").write_text(f"{directory}\n")
+    return directory
+
+
+def setup(directory: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    inherited = {name: value for name, value in os.environ.items() if name not in ("BUILD", "MAKEFLAGS", "PYTHON3")}
+    return subprocess.run(
+        ["make", "-C", str(directory), "setup", *words], env=inherited | environment, capture_output=True, text=True,
+        timeout=60, check=False,
+    )  # fmt: skip
+
+
+def without_venv(directory: Path) -> Path:
+    """A Python that makes no environment, but says where it should."""
+    python = directory / "python3"
+    python.write_text(
+        f'#!/bin/sh\ncase $1 in -m) echo "makes $3" >&2; exit 1 ;; *) exec {sys.executable} "$@" ;; esac\n'
+    )
+    python.chmod(0o755)
+    return python
+
+
+def test_a_good_environment_is_left_alone(tmp_path: Path) -> None:
+    done = setup(checkout(tmp_path), PYTHON3="/bin/false")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_moved_checkout_gets_an_environment_of_its_own(tmp_path: Path) -> None:
+    """Seen to fail: a copy of a checkout ran the code of the first, and after a move nothing ran."""
+    checkout(tmp_path / "first")
+    (tmp_path / "first").rename(tmp_path / "second")
+    python = without_venv(tmp_path)
+    said = setup(tmp_path / "second", PYTHON3=str(python)).stderr.splitlines()
+    assert said[:2] == [
+        "build/venv was made in another place: it is made anew", f"makes {tmp_path / 'second/build/venv'}"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ("place", "was made in another place"),
+        ("python", "was made by a Python that is gone"),
+        ("version", "was made by another version of Python"),
+        ("", ""),
+    ],
+)
+def test_why_an_environment_cannot_be_used(tmp_path: Path, damage: str, said: str) -> None:
+    """Such as after a move, the removal of pyenv's Python, or an upgrade of the system."""
+    venv = checkout(tmp_path / "a b" / "first") / "build" / "venv"
+    if damage == "place":
+        venv = venv.rename(tmp_path / "venv")
+    elif damage == "python":
+        (venv / "bin/python3").unlink()
+        (venv / "bin/python3").symlink_to(tmp_path / "python3.11")
+    elif damage == "version":
+        (found,) = (venv / "lib").iterdir()
+        found.rename(venv / "lib" / "python3.1")
+    argv = [str(paths.PROJECT / "images" / "environment-state"), str(venv)]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, said, "")
+
+
+def test_an_editable_install_is_of_this_checkout(tmp_path: Path) -> None:
+    """Where BUILD= names a place that stays: seen to fail, the first checkout's code ran."""
+    first = checkout(tmp_path / "first")
+    (first / "build/venv/.installed").write_text("/another/place\n")
+    assert setup(first, PYTHON3="/bin/false").returncode == 0
+    assert (first / "build/venv/.installed").read_text() == f"{first}\n"
+
+
+@pytest.mark.parametrize("version", ["3.10.12", "2.7.18"])
+def test_an_old_python_is_refused_before_anything_is_installed(tmp_path: Path, version: str) -> None:
+    """Seen to fail with Python 3.10: packages were installed by sudo, then pip said which of uv's it did not find."""
+    old = tmp_path / "old python"
+    old.write_text(f"#!/bin/sh\necho {version}\nexit 1\n")
+    old.chmod(0o755)
+    directory = checkout(tmp_path / "first")
+    (directory / "build/venv/.complete").unlink()
+    done = setup(directory, PYTHON3=str(old))
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[0] == (
+        f"error: {old} is Python {version}; Python 3.11 or newer with venv and ensurepip is needed: name one, "
+        "PYTHON3=python3.12"
+    )
+
+
+def test_a_second_make_waits_for_the_first_and_does_nothing_again(tmp_path: Path) -> None:
+    """Seen to fail: both removed the environment that the other was making."""
+    directory = checkout(tmp_path)
+    complete = directory / "build/venv/.complete"
+    os.utime(complete, (0, 0))  # older than the locks
+    with (directory / "build/.venv.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        argv = ["make", "-C", str(directory), "setup", f"PYTHON3={without_venv(tmp_path)}"]
+        with subprocess.Popen(argv, stderr=subprocess.PIPE, text=True) as second:
+            assert second.stderr
+            try:
+                assert second.stderr.readline() == "build/venv: another make sets it up; waiting for that\n"
+                os.utime(complete)
+                fcntl.flock(lock, fcntl.LOCK_UN)
+                said = second.stderr.read()
+            finally:
+                fcntl.flock(lock, fcntl.LOCK_UN)
+    assert (second.returncode, said) == (0, "")
+
+
+def test_a_checkout_with_the_line_ends_of_windows_is_refused(tmp_path: Path) -> None:
+    """Seen to fail: `images/install-host-packages: not found`."""
+    (tmp_path / "Makefile").write_bytes((paths.PROJECT / "Makefile").read_bytes().replace(b"\n", b"\r\n"))
+    done = subprocess.run(["make", "-C", str(tmp_path), "help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "the files of this checkout end their lines with CR LF; take a new clone" in done.stderr
+
+
+def test_git_leaves_the_lines_of_a_checkout_as_they_are(tmp_path: Path) -> None:
+    """Seen to fail with core.autocrlf=true: shells found no command, and hashes of inputs were others."""
+    before = {"script": b"#!/bin/sh\necho\n", "stream": b"a\r\nb\r\n", "mixed": b"a\r\nb\n"}
+    for name, content in before.items():
+        (tmp_path / name).write_bytes(content)
+    shutil.copy(paths.PROJECT / ".gitattributes", tmp_path)
+    git = ["git", "-C", str(tmp_path), "-c", "core.autocrlf=true", "-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "a"]):
+        subprocess.run([*git, *words], check=True, capture_output=True)
+    for name in before:
+        (tmp_path / name).unlink()
+    subprocess.run([*git, "checkout", "-q", "--", "."], check=True, capture_output=True)
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
