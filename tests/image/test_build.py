@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import os
+import random
 import re
 import select
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from flotilla.common import namespace, paths
+from flotilla.common import namespace, paths, progress
 from flotilla.fleet import inventory
+from images.builder import build as builder
 
 ROBOT = 3
 BOARD = inventory.load_fleet().robots[ROBOT].board
+MOMENTS = 10
 _PATIENCE_S = 1500
 """Some 30 s on an idle host; on a busy one it took 300."""
 
@@ -48,6 +52,15 @@ def _argv(build: Path) -> tuple[list[str], dict[str, str]]:
     return [sys.executable, "-m", "flotilla", "image", str(ROBOT)], os.environ | {"BUILD": str(build)}
 
 
+def _begin(build: Path) -> subprocess.Popen[str]:
+    argv, environment = _argv(build)
+    return subprocess.Popen(
+        ["env", "--default-signal=INT", *argv],  # background jobs of a script inherit that it is ignored
+        env=environment, cwd=paths.PROJECT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+
+
 def _in_namespace(script: str, argv: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
     """Run a build after a shell script that changes the mounts it sees."""
     whole = [*namespace.prefix(), "sh", "-c", script, "sh", *argv]
@@ -74,11 +87,7 @@ def running(build: Path) -> Iterator[subprocess.Popen[str]]:
     for kind in ("tools", "runtime"):
         for result in paths.CACHE.glob(f"{kind}-*[0-9a-f]"):
             shutil.copytree(result, build / "cache" / result.name, symlinks=True, copy_function=_link)
-    argv, environment = _argv(build)
-    process = subprocess.Popen(
-        ["env", "--default-signal=INT", *argv],  # background jobs of a script inherit that it is ignored
-        env=environment, cwd=paths.PROJECT, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+    process = _begin(build)
     log = build / f"rootfs-{BOARD}.log"
     timer = select.poll()  # waits for the process's end, and wakes now and then to look at the log
     descriptor = os.pidfd_open(process.pid)
@@ -139,6 +148,98 @@ def test_a_killed_build_leaves_no_process_and_no_result(build: Path, running: su
     assert _processes(build) == set()
     assert [path.suffix for path in (build / "cache").glob("rootfs-*")] == [".part"], "half, and named so"
     assert (build / "images" / "robot3.img").read_text() == "the last good image"
+
+
+def _events(build: Path) -> list[str]:
+    """What a build has done so far: results and images begun and made, parts of the root, every tenth package."""
+    files = [*build.glob("cache/*-*"), *build.glob("images/.*.part")]
+    made = sorted(path.relative_to(build).as_posix() for path in files if not path.name.endswith((".json", ".lock")))
+    log = build / f"rootfs-{BOARD}.log"
+    lines = re.findall(r"^(?:== \w+$|I: (?:Unpacking|Configuring)|Setting up).*", progress.text(log), re.MULTILINE)
+    return made + [line for number, line in enumerate(lines) if line.startswith("==") or not number % 10]
+
+
+def _wait_for_events(build: Path, process: subprocess.Popen[str], count: int) -> str:
+    """Until so many have come since now; what the last one is. Or until the build ends: nothing."""
+    before = set(_events(build))
+    end = time.monotonic() + _PATIENCE_S
+    descriptor = os.pidfd_open(process.pid)
+    try:
+        while not select.select([descriptor], [], [], 0.05)[0]:
+            new = [event for event in _events(build) if event not in before]
+            if len(new) >= count:
+                return new[-1]
+            assert time.monotonic() < end, "the build makes no progress"
+    finally:
+        os.close(descriptor)
+    return ""
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _right_image(directory: Path) -> str:
+    """SHA-256 of what an undisturbed build makes."""
+    fleet = inventory.load_fleet()
+    (image,) = builder.build(fleet, [fleet.robots[ROBOT]], directory)
+    return _sha256(image)
+
+
+@pytest.mark.nightly  # the tests above interrupt and kill a build once
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill-9"])
+def test_interrupted_at_any_moments_the_next_build_makes_the_right_image(
+    build: Path, tmp_path: Path, how: signal.Signals
+) -> None:
+    """Each build begins with what the one before has left, until one ends; then another begins without results."""
+    seed = random.SystemRandom().randrange(1 << 32)
+    print(f"seed {seed}")  # shown if it fails
+    chosen = random.Random(seed)
+    right = _right_image(tmp_path / "right")
+    interrupted = 0
+    while interrupted < MOMENTS:
+        (build / f"rootfs-{BOARD}.log").unlink(missing_ok=True)  # an earlier build's events do not count
+        process = _begin(build)
+        event = _wait_for_events(build, process, chosen.randint(1, 40))
+        if not event:
+            _, errors = process.communicate()
+            assert process.returncode == 0, errors
+            assert _sha256(build / "images" / "robot3.img") == right
+            shutil.rmtree(build / "cache")
+            continue
+        interrupted += 1
+        print(f"{interrupted}: {event}")
+        pids = _processes(build)
+        if how == signal.SIGINT:
+            os.killpg(process.pid, how)
+        else:
+            process.kill()
+        _, errors = process.communicate(timeout=60)
+        assert _gone(pids)
+        assert _processes(build) == set()
+        assert str(build) not in Path("/proc/self/mounts").read_text()
+        if how == signal.SIGINT:
+            assert process.returncode == 130, errors
+            assert "interrupted; the last good outputs are untouched" in errors
+            assert "Traceback" not in errors
+            assert not [*(build / "cache").glob("*.part"), *(build / "images").glob(".*")]
+    process = _begin(build)
+    _, errors = process.communicate(timeout=_PATIENCE_S)
+    assert process.returncode == 0, errors
+    assert _sha256(build / "images" / "robot3.img") == right
+    assert not [*(build / "cache").glob("*.part"), *(build / "images").glob(".*")]
+
+
+@pytest.mark.nightly  # two builds that wait for each other are in tests/unit/test_cache.py
+def test_three_builds_at_once_make_the_right_image(build: Path, tmp_path: Path) -> None:
+    right = _right_image(tmp_path / "right")
+    processes = [_begin(build) for _ in range(3)]
+    said = [process.communicate(timeout=_PATIENCE_S)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0], said
+    assert sum("wait for another command that holds" in each for each in said) == 2
+    assert _sha256(build / "images" / "robot3.img") == right
+    assert not [*(build / "cache").glob("*.part"), *(build / "images").glob(".*")]
 
 
 @pytest.mark.parametrize(
