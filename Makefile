@@ -16,7 +16,7 @@ FLOTILLA := $(PYTHON) -m flotilla
 # A part of a command: a line that moves on a terminal, a line at its end without one; what it says when it fails.
 step = $(PYTHON) -m flotilla.common.progress
 Q := $(if $(filter-out 0,$(V)),,@)
-export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS PYTHON3
+export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS PART PYTHON3
 # Python imports no packages of the user's, and pip puts none among them.
 unexport PYTHONHOME PYTHONPATH PIP_PREFIX PIP_TARGET PIP_USER
 MAKEFLAGS += --no-print-directory
@@ -37,7 +37,7 @@ flash: | setup ## write a card and read it back: make flash ROBOT=3 DEV=/dev/sdX
 	$(Q)$(FLOTILLA) flash $(call need,ROBOT) $(or $(call option,--file,CARD),$(call need,DEV)) \
 	    $(call option,--force,FORCE)
 
-boot: | setup-tests ## boot a robot's image in QEMU on this terminal
+boot: | setup-lab ## boot a robot's image in QEMU on this terminal
 	$(Q)$(FLOTILLA) boot $(call need,ROBOT)
 
 ssh: | setup ## shell on a robot, or on its guest when one runs: make ssh ROBOT=3
@@ -57,22 +57,22 @@ size: | setup ## the largest packages and files of a robot's image
 
 ##@ Fleet
 .PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave station-time
-fleet: | setup-tests ## a virtual fleet of guests in the background, to try things on: make fleet N=4 [LINK=ibss]
+fleet: | setup-lab ## a virtual fleet of guests in the background, to try things on: make fleet N=4 [LINK=ibss]
 	$(Q)$(FLOTILLA) fleet up $(call need,N) $(call option,--link,LINK)
 
-fleet-status: | setup-tests ## what the guests of the virtual fleet do
+fleet-status: | setup-lab ## what the guests of the virtual fleet do
 	$(Q)$(FLOTILLA) fleet status
 
-fleet-down: | setup-tests ## end the virtual fleet
+fleet-down: | setup-lab ## end the virtual fleet
 	$(Q)$(FLOTILLA) fleet down
 
-wheeled: | setup-tests ## wheeled robots in a room, to be driven from this computer, until Ctrl-C: make wheeled [N=1] [ROOM=corner]
+wheeled: | setup-lab setup-runtime ## wheeled robots in a room, to be driven from this computer, until Ctrl-C: make wheeled [N=1] [ROOM=corner]
 	$(Q)$(FLOTILLA) wheeled $(call option,--room,ROOM) $(if $(value N),$(call given,N))
 
-wheeled-down: | setup-tests ## end them
+wheeled-down: | setup-lab setup-runtime ## end them
 	$(Q)$(FLOTILLA) wheeled-down
 
-fleet-scale: | setup-tests ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
+fleet-scale: | setup-lab ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
 	$(Q)$(FLOTILLA) fleet-scale $(call need,N) $(call option,--board,BOARD)
 
 radio-capacity: | setup ## how many robots one radio cell carries, simulated [INVENTORY=dir STANDARD=b|b-short|g|g-mixed RATE=11M AREA=10 PHASES=random UPDATE=1 LIMIT=10 MISSED=1 COMPUTE=400 SEED=1]
@@ -171,31 +171,36 @@ lint: | setup-tests docs
 	$(Q)$(step) "shell scripts" shellcheck $$($(call shell_scripts))
 	$(Q)$(step) "playbooks" env -C ansible PATH="$(abspath $(VENV))/bin:$$PATH" ansible-lint --offline -q .
 
-# Three at a time: tests that keep step with a clock come first, and need next to nothing; all else is nice to them. Then
-# comes the kernel, which tests wait for. Without make's job server, which ninja cannot use from here.
+# Three at a time: tests that keep step with a clock come first, and need next to nothing; all else is nice to them. With
+# all tests the own kernel comes too, which some of these wait for: without make's job server, which ninja cannot use.
 COSTS = $(abspath $(BUILD))/reports/costs
 TIERS := unit runtime image boot nightly
 lanes_unit = test-others
 lanes_runtime = test-clock test-others
 lanes_image = test-others
-lanes_boot = test-kernel test-others
-lanes_nightly = $(lanes_boot)
-lanes_ = test-kernel test-clock test-others
-test: | setup-tests ## checks, a short fuzzing, images, boots in QEMU; one tier alone: TIER=unit|runtime|image|boot|nightly
-	$(if $(filter-out $(TIERS),$(TIER)),$(error TIER=$(TIER): take one of $(TIERS)))
+lanes_boot = test-others
+lanes_nightly = $(test_kernel) test-others
+lanes_all = $(test_kernel) test-clock test-others
+lanes_ = test-clock test-others
+# A part compiles it where one of its tests asks for it.
+test_kernel = $(if $(value PART),,test-kernel)
+test: | setup-tests ## checks, images, and a test of each area in QEMU: what CI runs; one tier alone: TIER=unit|runtime|image|boot|nightly
+	$(if $(filter-out $(TIERS) all,$(TIER)),$(error TIER=$(TIER): take one of $(TIERS)))
+	$(if $(filter all nightly,$(TIER)),$(Q)images/install-host-packages tests/all-packages.txt)
 	$(Q)mkdir -p $(dir $(COSTS)); rm -f $(COSTS)
 	$(Q)MAKEFLAGS= TIER=$(TIER) COSTS=$(COSTS) $(PYTHON) -m tests.costs run "in all" \
 	    $(MAKE) --no-print-directory -k -j3 $(lanes_$(TIER)); status=$$?; \
 	    $(PYTHON) -m tests.costs show $(COSTS); exit $$status
 
-test-all: test ## the same, and tests that take minutes for one answer
-	$(Q)$(MAKE) test TIER=nightly
+test-all: | setup-tests ## every test there is, hours; in parts of the same cost: make test-all [PART=3/8]
+	$(Q)$(MAKE) test TIER=all
 
 .PHONY: test-kernel test-clock test-others
 run_tests = $(VENV)/bin/pytest tests --durations=20 --durations-min=10
 accounted = $(PYTHON) -m tests.costs run
 cost = nice -n 10 $(accounted)
-selected = $(or $(TIER),not nightly)
+selected_all = (nightly or not nightly)
+selected = $(or $(selected_$(TIER)),$(TIER),not nightly)
 test-kernel: | setup-tests
 	$(Q)nice -n 5 $(accounted) kernel $(FLOTILLA) kernel
 
@@ -203,8 +208,10 @@ test-clock: | setup-tests
 	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory runtime
 	$(Q)$(run_tests) -m '$(selected) and clock' >$(COSTS).clock 2>&1; status=$$?; cat $(COSTS).clock; exit $$status
 
+# What is no test belongs to the first part.
+checked = $(if $(TIER:all=),,$(if $(value PART),$(filter 1/%,$(value PART)),yes))
 test-others: | setup-tests
-ifeq ($(TIER),)
+ifneq ($(checked),)
 	$(Q)MAKEFLAGS= $(cost) lint $(MAKE) --no-print-directory lint
 	$(Q)MAKEFLAGS= $(cost) check-runtime $(MAKE) --no-print-directory check-runtime
 	@# With a seed, so that whoever changed nothing finds nothing.
@@ -235,7 +242,7 @@ coverage: | setup-tests ## branches of Python and C that unit and runtime tests 
 	    --html-nested $(coverage_report)/c/index.html --print-summary $(covered)/runtime
 	$(Q)! grep -v -x 0 $(covered)/status
 
-power-cuts: | setup-tests ## every power cut of updates replayed: bricks, wrong releases, mistakes found [BOARD=] [MIB=16]
+power-cuts: | setup-lab setup-runtime ## every power cut of updates replayed: bricks, wrong releases, mistakes found [BOARD=] [MIB=16]
 	$(Q)$(FLOTILLA) power-cuts $(call option,--board,BOARD) $(call option,--mib,MIB)
 
 bench: | setup-tests ## wall times and ratios against other builders
@@ -249,12 +256,12 @@ configured = { test -f $1/build.ninja && test "$$(cat $1/.place 2>&1)" = "$$(pwd
     { rm -rf $1; $2 $(meson) setup $1 runtime $3 >/dev/null; pwd -P >$1/.place; }
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
-runtime: | setup-tests ## the runtime's programs for this computer, in build/runtime
+runtime: | setup-runtime ## the runtime's programs for this computer, in build/runtime
 	@# One after the other: processes that run tests ask for it at once.
 	$(Q)mkdir -p $(BUILD); flock $(BUILD)/.runtime.lock sh -e -c $(call quoted,$(call \
 	    configured,$(BUILD)/runtime); $(call compile,$(BUILD)/runtime))
 
-check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
+check-runtime: | setup-runtime ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
 	$(Q)$(step) "format of C" $(VENV)/bin/clang-format --dry-run -Werror $$(git ls-files '*.[ch]')
 	$(Q)set -e; $(call configured,$(BUILD)/runtime-sanitized,,-Dtests=true \
 	    -Db_sanitize=address$(comma)undefined -Dbuildtype=debugoptimized)
@@ -262,7 +269,7 @@ check-runtime: | setup-tests ## format of all C, the runtime's clang-tidy and un
 	$(Q)$(step) "clang-tidy" $(PYTHON) -m runtime.tidy $(BUILD)/runtime-sanitized
 	$(Q)$(step) "unit tests of C" env $(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
-fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60 SEED=]; finds go to build/found
+fuzz: | setup-runtime ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60 SEED=]; finds go to build/found
 	$(Q)images/install-host-packages tests/fuzz-packages.txt
 	$(Q)set -e; $(call configured,$(BUILD)/fuzz,CC=clang,-Dtests=true -Dfuzz=true -Dbuildtype=debugoptimized)
 	$(Q)$(call compile,$(BUILD)/fuzz,fuzzers)
@@ -273,7 +280,7 @@ fuzz: | setup-tests ## the runtime's parsers: a million streams each, then libFu
 	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(if $(value SECONDS),$(call given,SECONDS),60) $(if $(value SEED),-seed=$(call given,SEED)) -max_len=1024 -timeout=10 -verbosity=0 \
 	        -artifact_prefix=$$found- $$found $$known 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
-bench-runtime: | setup-tests runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
+bench-runtime: | setup-runtime runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
 	$(Q)images/install-host-packages runtime/bench/packages.txt
 	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(call option,--seconds,SECONDS) \
 	    $(call option,--rounds,ROUNDS)
@@ -320,30 +327,30 @@ scope: | setup ## signals of a task that runs: ROBOT=1 TASK=heading [SIGNALS="gy
 .PHONY: latency latency-accept boot-time hwcheck accept scenarios scenarios-accept
 # What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.
 measured = $(call option,--board,BOARD) $(call option,--kernel,KERNEL) $(call option,--plan,PLAN)
-latency: | setup-tests ## latency in virtual time against the accepted run, or limits (an hour): PLAN=standard [BOARD= KERNEL=lean|debian|no-rt PLAN=disk]; or TARGET=ssh:robot3
+latency: | setup-lab setup-runtime ## latency in virtual time against the accepted run, or limits (an hour): PLAN=standard [BOARD= KERNEL=lean|debian|no-rt PLAN=disk]; or TARGET=ssh:robot3
 	$(Q)$(FLOTILLA) latency $(measured) $(call option,--target,TARGET)
 
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
 	$(Q)$(FLOTILLA) hwcheck $(call need,ROBOT) $(call option,--seconds,SECONDS)
 
-accept: | setup-tests ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 RELAYS=1 WATCHDOG=1]
+accept: | setup-lab setup-runtime ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 RELAYS=1 WATCHDOG=1]
 	$(Q)$(FLOTILLA) accept $(call need,ROBOT) $(call option,--plan,PLAN) $(call option,--seconds,SECONDS) $(if $(filter-out 0,$(RELAYS)),--relays) \
 	    $(if $(filter-out 0,$(WATCHDOG)),--watchdog)
 
-latency-accept: | setup-tests ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
+latency-accept: | setup-lab setup-runtime ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
 	$(Q)$(FLOTILLA) latency-accept $(measured)
 
-boot-time: | setup-tests ## where a boot spends its time, in virtual time
+boot-time: | setup-lab setup-runtime ## where a boot spends its time, in virtual time
 	$(Q)$(FLOTILLA) boot-time $(measured)
 
-scenarios: | setup-tests ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ON=lockstep | ROBOTS=16]
+scenarios: | setup-lab setup-runtime ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ON=lockstep | ROBOTS=16]
 	$(Q)$(FLOTILLA) scenarios $(addprefix --,$(filter guests lockstep,$(ON))) $(call option,--link,LINK) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
 
-scenarios-accept: | setup-tests ## make a new run the accepted one: commit lab/scenarios/baseline.json
+scenarios-accept: | setup-lab setup-runtime ## make a new run the accepted one: commit lab/scenarios/baseline.json
 	$(Q)$(FLOTILLA) scenarios-accept
 
 ##@ Housekeeping
-.PHONY: setup setup-tests clean help
+.PHONY: setup setup-lab setup-runtime setup-tests clean help
 setup: $(VENV)/.installed ## install what building needs
 
 # Git may have been told to end lines with CR LF, or a program that unpacked an archive; shells take none of these.
@@ -362,8 +369,15 @@ $(VENV)/.installed: $(VENV)/.complete pyproject.toml
 	$(Q)set -e; $(alone); \
 	    $(VENV)/bin/pip install --quiet --no-index --no-deps --no-build-isolation --editable .; sync -f $(VENV); pwd -P >$@
 
+# Each command installs what it needs: guests, the runtime for this computer, a browser for the tests of pages.
+setup-lab: setup ## install what guests need
+	$(Q)images/install-host-packages tests/lab-packages.txt
+
+setup-runtime: setup ## install what the runtime for this computer needs
+	$(Q)images/install-host-packages tests/runtime-packages.txt
+
 setup-tests: setup ## install what testing needs
-	$(Q)images/install-host-packages tests/host-packages.txt
+	$(Q)images/install-host-packages tests/host-packages.txt tests/lab-packages.txt tests/runtime-packages.txt
 
 # pip brings uv alone: that installs all others in a quarter of pip's time.
 new_venv = "$$python" -m venv "$$(cd $(BUILD) && pwd -P)/venv"; \

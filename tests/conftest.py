@@ -36,7 +36,7 @@ from lab.qemu.guest import Guest
 from lab.qemu.segment import Segment, station_address
 from lab.qemu.ssh import Ssh
 
-pytest_plugins = ["tests.artefacts", "tests.figures", "tests.tiers", "tests.costs"]
+pytest_plugins = ["tests.artefacts", "tests.figures", "tests.tiers", "tests.costs", "tests.suite"]
 
 BOOT_SECONDS = 1200
 """Until the login prompt. Some 30 s on an idle host; the limit only has to be finite, and generous to a busy one."""

@@ -21,6 +21,8 @@ from images.builder import runtime
 from images.builder.lock import HOST
 from tests.fixtures import ert_rates
 
+pytestmark = pytest.mark.nightly  # Octave, which nothing else needs, is 261 MB
+
 STUBS = paths.PROJECT / "tests" / "fixtures" / "octave"
 FUNCTION = paths.PROJECT / "flotilla" / "apps" / "matlab"
 

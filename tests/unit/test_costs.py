@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -26,15 +27,26 @@ def test_rows_of_a_tier_are_added_up(tmp_path: Path) -> None:
     ]
 
 
-def test_the_dearest_files_come_below(tmp_path: Path) -> None:
-    """By processor time, and no more of them than help."""
+def test_the_slowest_tests_come_below(tmp_path: Path) -> None:
+    """Ten of them."""
     file = tmp_path / "costs"
     for number in range(20):
-        costs.record(str(file), f"tests/unit/test_{number}.py", tests=1, failed=0, seconds=60, processor_s=number)
-    costs.record(str(file), "unit", tests=20, failed=0, seconds=1200, processor_s=190)
+        name = f"tests/unit/test_a.py::test_{number}"
+        costs.record(str(file), "unit", name, tests=1, failed=0, seconds=number, processor_s=1)
     first, *others = [line.split()[0] for line in costs.table(file).splitlines()[1:]]
     assert first == "unit"
-    assert others == [f"tests/unit/test_{number}.py" for number in range(19, 19 - costs._DEAREST, -1)]
+    assert others == [f"tests/unit/test_a.py::test_{number}" for number in range(19, 9, -1)]
+
+
+def test_costs_of_good_runs_are_kept(tmp_path: Path) -> None:
+    file, kept = tmp_path / "costs", tmp_path / "costs.json"
+    kept.write_text('{"tests/unit/test_a.py::old": 9.0, "tests/unit/test_a.py::cheaper": 9.0}')
+    for name, failed, processor_s in (("dear", 0, 7.123), ("cheaper", 0, 0.1), ("red", 1, 60), ("old", 1, 70)):
+        record = {"tests": 1, "failed": failed, "seconds": 1, "processor_s": processor_s}
+        costs.record(str(file), "unit", f"tests/unit/test_a.py::{name}", **record)
+    costs.record(str(file), "lint", tests=0, failed=0, seconds=1, processor_s=90)
+    costs.keep(file, to=kept)
+    assert json.loads(kept.read_text()) == {"tests/unit/test_a.py::dear": 7.1, "tests/unit/test_a.py::old": 9.0}
 
 
 @pytest.mark.parametrize("status", [0, 3])

@@ -80,8 +80,11 @@ def make(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
     environment = {
         name: value for name, value in os.environ.items() if name not in ("BUILD", "KEYS", "APPS", "MAKEFLAGS")
     }
-    argv = ["make", "-C", str(paths.PROJECT), "-o", "setup", "-o", "setup-tests", f"BUILD={directory}", *words]
+    argv = ["make", "-C", str(paths.PROJECT), *UNPREPARED, f"BUILD={directory}", *words]
     return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+
+UNPREPARED = [word for target in ("setup", "setup-lab", "setup-runtime", "setup-tests") for word in ("-o", target)]
 
 
 def programs_said(directory: Path) -> list[list[str]]:

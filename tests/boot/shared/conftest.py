@@ -29,12 +29,8 @@ _STANDING[_FLEET.robots[PENTIUM].board] = PENTIUM
 SYSTEMS = [
     pytest.param((number, "debian"), id=f"{board}-debian")
     for board, number in sorted(_STANDING.items())
-] + [  # after those whose kernel has not to be built
-    pytest.param(
-        (number, "lean"), id=f"{board}-lean",
-        # It takes ten minutes to build, and `make test` builds that of the first robot's board.
-        marks=[] if board == _FLEET.board().name else [pytest.mark.nightly],
-    )
+] + [  # after those whose kernel has not to be built, which takes ten minutes
+    pytest.param((number, "lean"), id=f"{board}-lean", marks=pytest.mark.nightly)
     for board, number in sorted(_STANDING.items()) if board in kernel.names()
 ]  # fmt: skip
 """Boards and kernels that every image must boot with."""
