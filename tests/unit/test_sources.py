@@ -261,7 +261,9 @@ NOT_COUNTED = {
     "images.builder.runtime": "its result is counted by name",
     "images.builder.tools": "its result is counted by name",
     "images.builder.mirror": "how indexes of archives are read, for locks",
-    "images.builder.fetch": "how packages are downloaded, whose hashes are counted",
+    "images.builder.download": "how packages are downloaded, whose hashes are counted",
+    "flotilla.common.durable": "when results are on the disk",
+    "flotilla.common.processes": "how processes end",
     "flotilla.common.host": "what a computer must have",
 }
 
@@ -287,4 +289,5 @@ def test_all_code_of_a_stage_is_counted(stage: str) -> None:
         known |= waiting
         waiting = {module for file in waiting for module in imported(file)} - known
     assert {str(path) for path in known} <= set(COUNTED[stage])
+    assert all((paths.PROJECT / (name.replace(".", "/") + ".py")).is_file() for name in NOT_COUNTED)
     assert str(Path(initramfs.__file__).with_name("init")) in COUNTED[rootfs.__file__]
