@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from flotilla.common import namespace, paths
+from flotilla.common import cache, namespace, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet, System
 from images.builder import build, pool, rootfs, runtime, tools
@@ -88,11 +88,13 @@ def test_the_root_is_begun_before_the_runtime_is_compiled(
         assert not list(paths.CACHE.glob("rootfs-*"))
     else:
         made = rootfs.build(board, *locks)
-        assert sorted(path.name for path in made.iterdir()) == ["root.squashfs", "vmlinuz"]
+        assert sorted(path.name for path in made.glob("[!.]*")) == ["root.squashfs", "vmlinuz"]
         assert (made / "vmlinuz").read_text() == "package"
 
 
 def test_a_runtime_that_is_compiled_needs_no_packages(own_build: Path) -> None:
     assert [lock.name for lock in runtime.wanted(PC104)] == ["runtime-bookworm-i386"]
-    (own_build / "cache" / runtime.name(PC104)).mkdir(parents=True)
+    made = own_build / "cache" / runtime.name(PC104)
+    made.mkdir(parents=True)
+    (made / cache._LIST).write_text("{}")
     assert runtime.wanted(PC104) == []

@@ -83,7 +83,9 @@ def test_a_host_without_apt_is_refused(tmp_path: Path) -> None:
     assert "ANY_HOST" not in done.stderr
 
 
-@pytest.mark.parametrize(("os_release", "installed"), [(UBUNTU, "one two"), ("ID=debian\nVERSION_ID=13\n", "one three")])
+@pytest.mark.parametrize(
+    ("os_release", "installed"), [(UBUNTU, "one two"), ("ID=debian\nVERSION_ID=13\n", "one three")]
+)
 def test_some_packages_are_for_debian_alone_or_for_other_hosts(tmp_path: Path, os_release: str, installed: str) -> None:
     (tmp_path / "list").write_text("# a list\none # reason\ntwo [!debian] # reason\nthree [debian] # reason\n")
     said = 'echo "$@"'
