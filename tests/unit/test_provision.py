@@ -86,7 +86,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], dict[str, s
 def test_a_robot_has_the_name_that_the_inventory_gives_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[tuple[list[str], dict[str, str]]]
 ) -> None:
-    """Seen to fail: robot 3 was taken for `robot3`, and Ansible found no such host."""
+    """Robot 3 was once taken for `robot3`, and Ansible found no such host."""
     shutil.copytree(paths.INVENTORY, tmp_path / "inventory")
     robots = tmp_path / "inventory" / "robots.yml"
     robots.write_text(robots.read_text().replace("robot3:", "alpha:"))
@@ -101,7 +101,7 @@ def test_a_robot_has_the_name_that_the_inventory_gives_it(
 def test_a_playbook_has_the_configuration_of_this_project(
     monkeypatch: pytest.MonkeyPatch, played: list[tuple[list[str], dict[str, str]]]
 ) -> None:
-    """Seen to fail: the user's variables changed how robots were reached."""
+    """Once the user's variables changed how robots were reached."""
     for name, value in (("ANSIBLE_CONFIG", "/elsewhere.cfg"), ("ANSIBLE_FORKS", "1"), ("LC_ALL", "de_DE.ISO-8859-1")):
         monkeypatch.setenv(name, value)
     playbook.play("fleet", robot=None, guests=False, words=[])
