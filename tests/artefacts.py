@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import os
+import fcntl
+import itertools
 import re
 import shutil
 from collections.abc import Generator, Iterator
@@ -45,16 +46,25 @@ def artefacts(request: pytest.FixtureRequest) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def session_artefacts(request: pytest.FixtureRequest) -> Iterator[Path]:
-    """A directory of what many tests share, `build/test-artefacts/session/`: kept when any test failed.
+    """A directory of what many tests share, `build/test-artefacts/session-1/`: kept when any test failed.
 
-    Each of several processes that run tests (pytest-xdist) has one of its own.
+    Each process that runs tests has one of its own: the first that no other one holds, so that a later run removes what
+    a killed one left.
     """
-    directory = DIRECTORY / "-".join(["session", *filter(None, [os.environ.get("PYTEST_XDIST_WORKER")])])
-    shutil.rmtree(directory, ignore_errors=True)
-    directory.mkdir(parents=True)
-    yield directory
-    if not request.session.testsfailed:
-        shutil.rmtree(directory)
+    DIRECTORY.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        with (DIRECTORY / f".session-{number}.lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            directory = DIRECTORY / f"session-{number}"
+            shutil.rmtree(directory, ignore_errors=True)
+            directory.mkdir()
+            yield directory
+            if not request.session.testsfailed:
+                shutil.rmtree(directory)
+            return
 
 
 def directory_of(nodeid: str) -> Path:
