@@ -103,7 +103,7 @@ class Guest:
         self._powered_on = time.monotonic()
         self.execute("cont")
 
-    def off(self, timeout: float = 60) -> None:
+    def off(self, timeout: float = 600) -> None:
         self._steps.note("power button")
         self.execute("system_powerdown")
         self.wait_off(timeout)
@@ -166,7 +166,7 @@ class Guest:
         identifier = qemu.port_ids(self._board)[name]
         return f"socket://127.0.0.1:{self._running().sockets()[identifier]}"
 
-    def port(self, name: str, timeout: float = 10) -> serial.SerialBase:
+    def port(self, name: str, timeout: float = 600) -> serial.SerialBase:
         """The other end of a serial connector as an open pyserial port; `timeout` is that of its reads and writes."""
         return serial.serial_for_url(self.port_url(name), timeout=timeout, write_timeout=timeout)
 

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-END_SECONDS = 30
+END_SECONDS = 300
 
 
 def free(file: Path) -> IO[str] | None:

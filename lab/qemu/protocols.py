@@ -17,7 +17,7 @@ class Power(Protocol):
     def on(self) -> None:
         """Apply power; returns at once, not when the system is up."""
 
-    def off(self, timeout: float = 60) -> None:
+    def off(self, timeout: float = 600) -> None:
         """Press the power button and wait until the system has shut itself down."""
 
     def cut(self) -> None:
@@ -42,7 +42,7 @@ class Command(Protocol):
     """A shell of user `robot`. Over SSH in both worlds."""
 
     def run(
-        self, argv: Sequence[str], *, timeout: float = 60, check: bool = True, stdin: str = ""
+        self, argv: Sequence[str], *, timeout: float = 600, check: bool = True, stdin: str = ""
     ) -> CompletedProcess[str]:
         """Run a command there, arguments kept apart; with `check` a status other than 0 raises LabError."""
 

@@ -137,13 +137,13 @@ class Ssh:
         return [*self._within, "ssh", *self._options, self._host]
 
     def read(self, path: str) -> bytes:
-        done = self._run(["cat", "--", path], 60, b"")
+        done = self._run(["cat", "--", path], COMMAND_SECONDS, b"")
         if done.returncode:
             raise LabError(f"{self._robot.name}: cannot read {path}: {_text(done.stderr)}")
         return done.stdout
 
     def write(self, path: str, contents: bytes) -> None:
-        done = self._run(["dd", "status=none", f"of={path}"], 60, contents)
+        done = self._run(["dd", "status=none", f"of={path}"], COMMAND_SECONDS, contents)
         if done.returncode:
             raise LabError(f"{self._robot.name}: cannot write {path}: {_text(done.stderr)}")
 

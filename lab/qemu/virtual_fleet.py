@@ -45,7 +45,9 @@ _LOCK = DIRECTORY / "lock"
 """Locked by the process that holds the fleet, whose number stands in it: without the lock, all here is left behind."""
 _LOG = DIRECTORY / "log"
 BOOT_SECONDS = 900
-DOWN_SECONDS = 30
+DOWN_SECONDS = 300
+_ANSWER_SECONDS = 300
+"""Of one guest to `make fleet-status`."""
 LET_IN_SECONDS = 900
 """What Ansible waits for a guest to let it in. Only finite: a host that is slow is no robot that is away, which ssh's
 own questions (`ServerAliveInterval`) tell from it."""
@@ -151,7 +153,7 @@ def status() -> str:
     def ask(robot: Robot) -> str:
         try:
             done = subprocess.run(
-                [*ssh.command(robot), STATUS], capture_output=True, text=True, timeout=60, check=False
+                [*ssh.command(robot), STATUS], capture_output=True, text=True, timeout=_ANSWER_SECONDS, check=False
             )
         except subprocess.TimeoutExpired:
             return f"{robot.name}  no answer"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from flotilla.common import paths
 
-GUESTS = ("tests/boot", "tests/provisioning", "tests/end_to_end")
-"""Folders whose tests wait for emulated guests and for robots in containers."""
+GUESTS = ("tests/boot", "tests/provisioning", "tests/end_to_end", "lab/qemu")
+"""Folders of what waits for emulated guests and for robots in containers."""
 ENOUGH_S = 300
 """A limit only ends a run that hangs: what takes seconds on an idle computer takes a minute on a slow one."""
 NOTHING_COMES = {"0.3"}
@@ -35,7 +35,7 @@ def sources() -> Iterator[Path]:
         yield from sorted((paths.PROJECT / folder).rglob("*.py"))
 
 
-def test_no_test_of_guests_depends_on_the_speed_of_the_host() -> None:
+def test_nothing_that_waits_for_guests_depends_on_the_speed_of_the_host() -> None:
     """Seen to fail in nine files, for limits of 20 s to 180 s, one of which a busy host has exceeded."""
     found = {str(file.relative_to(paths.PROJECT)): limits for file in sources() if (limits := short(file.read_text()))}
     assert found == {}
