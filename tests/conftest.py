@@ -17,6 +17,7 @@ Check as much as possible on a shared guest: each boot costs half a minute. Leav
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -43,7 +44,12 @@ BOOT_SECONDS = 1200
 
 
 def pytest_configure() -> None:
-    """Let SIGINT interrupt what tests start: a shell makes what it starts in the background ignore it, children too."""
+    """Let SIGINT interrupt what tests start: a shell makes what it starts in the background ignore it, children too.
+
+    A make that a test starts is the first one: it has no part in the jobs of the make that started the tests.
+    """
+    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):
+        os.environ.pop(name, None)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -217,12 +217,10 @@ def commands(*pages: Path) -> list[str]:
 
 
 def run(command: str) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MAKELEVEL")}
     done = subprocess.run(
         command,
         shell=True,
         cwd=paths.PROJECT,
-        env=environment,
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

@@ -77,9 +77,7 @@ def make(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
     for name in ("python", "ansible-playbook"):
         (programs / name).write_text(RECORDER.format(python=sys.executable, said=str(directory / "said")))
         (programs / name).chmod(0o755)
-    environment = {
-        name: value for name, value in os.environ.items() if name not in ("BUILD", "KEYS", "APPS", "MAKEFLAGS")
-    }
+    environment = {name: value for name, value in os.environ.items() if name not in ("BUILD", "KEYS", "APPS")}
     argv = ["make", "-C", str(paths.PROJECT), *UNPREPARED, f"BUILD={directory}", *words]
     return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60, check=False)
 
@@ -202,10 +200,9 @@ def test_an_environment_that_cannot_be_made_leaves_the_last_one(tmp_path: Path, 
     half = f'#!/bin/sh\ncase $1 in -m) ;; *) exec {sys.executable} "$@" ;; esac\nmkdir {last}\n'
     (programs / "python3").write_text(half + ("kill -INT $PPID" if interrupted else "exit 1"))
     (programs / "python3").chmod(0o755)
-    environment = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}
     done = subprocess.run(
         ["make", "-C", str(paths.PROJECT), f"BUILD={tmp_path / 'build'}", f"{last}/.complete"],
-        env=environment | {"PATH": f"{programs}:{os.environ['PATH']}"}, capture_output=True, text=True, timeout=60,
+        env=os.environ | {"PATH": f"{programs}:{os.environ['PATH']}"}, capture_output=True, text=True, timeout=60,
         check=False,
     )  # fmt: skip
     assert done.returncode != 0
@@ -242,7 +239,7 @@ def checkout(directory: Path) -> Path:
 
 
 def setup(directory: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    inherited = {name: value for name, value in os.environ.items() if name not in ("BUILD", "MAKEFLAGS", "PYTHON3")}
+    inherited = {name: value for name, value in os.environ.items() if name not in ("BUILD", "PYTHON3")}
     return subprocess.run(
         ["make", "-C", str(directory), "setup", *words], env=inherited | environment, capture_output=True, text=True,
         timeout=60, check=False,
@@ -331,7 +328,7 @@ def test_a_second_make_waits_for_the_first_and_does_nothing_again(tmp_path: Path
     os.utime(complete, (0, 0))  # older than the locks
     with (directory / "build/.venv.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        argv = ["make", "-C", str(directory), "setup", f"PYTHON3={without_venv(tmp_path)}"]
+        argv = ["make", "-C", str(directory), "setup", "BUILD=build", f"PYTHON3={without_venv(tmp_path)}"]
         with subprocess.Popen(argv, stderr=subprocess.PIPE, text=True) as second:
             assert second.stderr
             try:
