@@ -325,7 +325,8 @@ def test_a_disk_is_refused_where_it_is_too_small_alone(build: Path) -> None:
     assert outcomes == {(1, False), (0, True)}
 
 
-def test_a_wrong_hash_in_the_pool_stops_the_build(build: Path) -> None:
+def test_a_damaged_package_enters_no_image(build: Path) -> None:
+    """It is removed, and where no mirror has it the build ends."""
     from images.builder.lock import read_lock
 
     package = read_lock(BOARD).packages[0]
@@ -335,10 +336,14 @@ def test_a_wrong_hash_in_the_pool_stops_the_build(build: Path) -> None:
     file.unlink()  # it is a link to the real pool's
     file.write_bytes(content)
     argv, environment = _argv(build)
+    nobody = "http://127.0.0.1:9/debian"
+    environment |= {"MIRROR": nobody, "SECURITY_MIRROR": nobody, "no_proxy": "127.0.0.1"}
     done = subprocess.run(argv, env=environment, cwd=paths.PROJECT, capture_output=True, text=True)
     assert done.returncode == 1
     assert f"package {package.name} {package.version}" in done.stderr
-    assert "delete the file and run again" in done.stderr
+    assert "is damaged; it is removed and downloaded anew" in done.stderr
+    assert "or name a mirror that it lets through with MIRROR=" in done.stderr
+    assert not file.exists()
     assert (build / "images" / "robot3.img").read_text() == "the last good image"
 
 

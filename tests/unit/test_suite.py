@@ -76,7 +76,8 @@ def test_a_part_that_there_is_not_is_refused(text: str) -> None:
 
 def run_pytest(directory: Path, *options: str, **environment: str) -> list[str]:
     """What pytest prints with the plugins of the suite."""
-    variables = {name: value for name, value in os.environ.items() if name not in ("PART", "COSTS")}
+    inherited = ("PART", "COSTS", "PYTEST_XDIST")  # of the run that this test belongs to
+    variables = {name: value for name, value in os.environ.items() if not name.startswith(inherited)}
     variables |= environment | {"PYTHONPATH": str(paths.PROJECT)}
     argv = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options]
     done = subprocess.run(argv, cwd=directory, env=variables, capture_output=True, text=True)
