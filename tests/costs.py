@@ -78,7 +78,7 @@ def pytest_runtest_makereport(
 def pytest_configure(config: pytest.Config) -> None:
     """What tests run is a part of them, and has no row of its own."""
     file = os.environ.pop("COSTS", None)
-    if "PYTEST_XDIST_WORKER" not in os.environ:  # its reports come to the process that started it
+    if not hasattr(config, "workerinput"):  # its reports come to the process that started it
         config.pluginmanager.register(_Recorder(file))
 
 

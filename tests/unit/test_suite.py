@@ -76,8 +76,7 @@ def test_a_part_that_there_is_not_is_refused(text: str) -> None:
 
 def run_pytest(directory: Path, *options: str, **environment: str) -> list[str]:
     """What pytest prints with the plugins of the suite."""
-    inherited = ("PART", "COSTS", "PYTEST_XDIST")  # of the run that this test belongs to
-    variables = {name: value for name, value in os.environ.items() if not name.startswith(inherited)}
+    variables = {name: value for name, value in os.environ.items() if name not in ("PART", "COSTS")}
     variables |= environment | {"PYTHONPATH": str(paths.PROJECT)}
     argv = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options]
     done = subprocess.run(argv, cwd=directory, env=variables, capture_output=True, text=True)
