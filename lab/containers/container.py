@@ -155,7 +155,8 @@ for run in /mnt/"$0"-*; do
         grep -q 'populated 1' "$run/cgroup.events" || break
         sleep 0.1
     done
-    grep -q 'populated 1' "$run/cgroup.events" || find "$run" -depth -type d -exec rmdir {} +
+    # Another that begins now may remove the same one.
+    grep -q 'populated 1' "$run/cgroup.events" || find "$run" -depth -type d -exec rmdir {} + || [ ! -d "$run" ]
 done"""
     _run(*namespace.prefix(), "sh", "-c", script, _CGROUPS)
 
