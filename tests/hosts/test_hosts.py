@@ -151,7 +151,7 @@ def test_cards_have_the_same_bytes_on_each_host_for_each_user(
 
 @pytest.mark.parametrize("host", [host for host in SUPPORTED if host.id not in IMITATED], ids="-".join)
 def test_checks_pass_for_an_ordinary_user(cards: Cards, host: Host) -> None:
-    """Seen to fail: tests of what the host has to offer knew root and Python 3.11 alone."""
+    """Unit tests alone were run so: those of what the host has to offer knew root and Python 3.11 alone."""
     (somebody,) = (each for each in EVERYBODY if (each.host, each.user) == (host, USER))
     checkout, _ = cards(somebody)
     checkout.make("check")
