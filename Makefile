@@ -353,7 +353,7 @@ scenarios-accept: | setup-lab setup-runtime ## make a new run the accepted one: 
 .PHONY: setup setup-lab setup-runtime setup-tests clean help
 setup: $(VENV)/.installed ## install what building needs
 
-# Git may have been told to end lines with CR LF, or a program that unpacked an archive; shells take none of these.
+# Git, or the program that unpacked an archive, may have ended lines with CR LF, which shells do not accept.
 $(if $(shell grep -l "$$(printf '\r')" images/install-host-packages Makefile),$(error the files of this checkout end their \
     lines with CR LF; take a new clone of the repository, or unpack the archive without a conversion of texts))
 

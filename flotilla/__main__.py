@@ -34,7 +34,7 @@ def program() -> int:
 
 
 def _use_utf8() -> None:
-    """Read and write files in UTF-8 in every locale; print in the locale's characters, with `?` for those it lacks."""
+    """Read and write files in UTF-8 in every locale; print in the locale's characters, with `?` for others."""
     encoding = codecs.lookup(locale.getencoding()).name
     if encoding not in ("utf-8", "ascii") and not sys.flags.utf8_mode:
         os.environ["PYTHONUTF8"] = "1"  # which Python reads when it starts

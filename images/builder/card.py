@@ -275,9 +275,8 @@ def data_partition(
     board: Board, tools: Tools, out: Path, nodes: list[Node], epoch: int, start: int | None = None
 ) -> Extents:
     """Write the data partition with the robot's files, as the file `out`, or so many bytes behind its beginning."""
-    with (
-        host.explaining_a_full_disk()
-    ):  # here, because debugfs says nothing of it, and the caller removes what fills it
+    # Here, because debugfs does not report a full disk, and the caller removes what fills it.
+    with host.explaining_a_full_disk():
         return filesystem.make(
             tools, out, data(board).size, nodes, kind="ext4", label="data", uuid=_DATA_UUID, epoch=epoch, start=start
         )

@@ -528,8 +528,8 @@ def checkout(directory: Path = paths.PROJECT) -> Source | str:
     """Commit and cleanliness of the checkout that `directory` is the top of; why they are unknown otherwise.
 
     Another user may own the checkout. So no command of git's reads more than its objects: the others run programs that
-    the repository's configuration names (core.fsmonitor, filters). And git would leave out what it was told to ignore,
-    and is in the image all the same.
+    the repository's configuration names (core.fsmonitor, filters). And git would leave out the files that it
+    ignores, which are in the image all the same.
     """
     try:
         top, commit = _git(directory, "rev-parse", "--show-toplevel", "HEAD").decode().splitlines()

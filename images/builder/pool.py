@@ -33,7 +33,7 @@ def file(package: Package) -> Path:
 
 
 def fill(locks: Iterable[Lock], mirrors: Mirrors | None = None) -> None:
-    """Download what the locks name and the pool lacks, or has at another size. See also `verify_hashes`."""
+    """Download the packages that the pool does not have, or has at another size. See also `verify_hashes`."""
     wanted = {package.sha256: (lock, package) for lock in locks for package in lock.packages}
     if not _missing(wanted):
         return
