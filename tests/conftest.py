@@ -12,7 +12,8 @@ A guest runs the very image that `make flash` would write, and nothing enters it
         robot.machine.on()
         robot.wait_booted()
 
-Check as much as possible on a shared guest: each boot costs half a minute. Leave a shared guest as you found it.
+A fresh guest begins booted, restored from what was saved of the first one like it; `cold=True` has it boot.
+Check as much as possible on a shared guest, and leave it as you found it.
 """
 
 from __future__ import annotations
@@ -32,15 +33,13 @@ from flotilla.common import paths
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet, Robot
 from images.builder.build import build, image_of
-from lab.qemu import qemu
+from lab.qemu import qemu, saved
 from lab.qemu.guest import Guest
+from lab.qemu.saved import BOOT_SECONDS
 from lab.qemu.segment import Segment, station_address
 from lab.qemu.ssh import Ssh
 
 pytest_plugins = ["tests.artefacts", "tests.figures", "tests.tiers", "tests.costs", "tests.suite"]
-
-BOOT_SECONDS = 1200
-"""Until the login prompt. Some 30 s on an idle host; the limit only has to be finite, and generous to a busy one."""
 
 
 def pytest_configure() -> None:
@@ -76,9 +75,9 @@ class RobotGuest:
 GuestFactory = Callable[..., RobotGuest]
 """`guest(number)`: the robot's guest, booted, with SSH connected; `kernel=` for another than its board's.
 
-`fresh_guest` also takes `disk=` for another bus of the card, the arguments of `Guest` (`card_bytes=`, `capture=True`),
-`qemu_options=` (a dict of fields of `qemu.Options`), `segment=segment` to put it on a network with others, `boot=False`
-to power it on oneself, and `image=` with a `label=` for another card."""
+`fresh_guest` also takes `cold=True` to have it boot, `disk=` for another bus of the card, the arguments of `Guest`
+(`card_bytes=`, `capture=True`), `qemu_options=` (a dict of fields of `qemu.Options`), `segment=segment` to put it on a
+network with others, `boot=False` to power it on oneself, and `image=` with a `label=` for another card."""
 
 
 @pytest.fixture(scope="session")
@@ -103,8 +102,8 @@ def flotilla_slot(flotilla_run: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def guest(fleet: Fleet, session_artefacts: Path) -> Iterator[GuestFactory]:
-    """`guest(3)`: robot 3, booted when a test first asks and shared by all that ask later. `guest(3, "debian")` is the
-    same robot with another kernel than its board's.
+    """`guest(3)`: robot 3, which boots when a test first asks and is shared by all that ask later. `guest(3, "debian")`
+    is the same robot with another kernel than its board's.
 
     A boot that failed is not tried again: every test that needs it fails at once, with the first cause.
     """
@@ -116,7 +115,7 @@ def guest(fleet: Fleet, session_artefacts: Path) -> Iterator[GuestFactory]:
             if key not in booted:
                 directory = session_artefacts / "robot{}-{}".format(*key)
                 try:
-                    booted[key] = _boot(fleet, number, directory, cleanup, kernel=kernel)
+                    booted[key] = _boot(fleet, number, directory, cleanup, kernel=kernel, cold=True)
                 except BaseException as error:
                     booted[key] = error
             found = booted[key]
@@ -165,6 +164,7 @@ def _boot(
     kernel: str | None = None,
     disk: str | None = None,
     boot: bool = True,
+    cold: bool = False,
     segment: Segment | None = None,
     qemu_options: dict[str, Any] | None = None,
     image: Path | None = None,
@@ -190,8 +190,7 @@ def _boot(
     port = (lambda: segment.ssh_port(robot.address)) if segment else machine.ssh_port
     guest = RobotGuest(robot, board, image, machine, cleanup.enter_context(Ssh(robot, "127.0.0.1", port)))
     if boot:
-        machine.on()
-        guest.wait_booted()
+        saved.begin(machine, robot, guest.shell, cold=cold)
     return guest
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
+import shutil
 import socket
 import time
 from dataclasses import replace
@@ -16,6 +18,12 @@ from lab.qemu import qemu
 from lab.qemu.console import SerialConsole
 from lab.qemu.process import Emulator, Exited
 from lab.qemu.timing import LabError, Steps
+
+_SAVED_MACHINE, _SAVED_CARD = "machine", "card.qcow2"
+_STATE_SECONDS = 600
+"""Limit for what takes less than one on an idle host: the memory of a guest to a file, and back."""
+_STATE_BYTES_S = 10**11
+"""QEMU would save a guest as slowly as it moves one over a network."""
 
 
 class Guest:
@@ -36,17 +44,19 @@ class Guest:
         capture: bool = False,
     ) -> None:
         """`options`: link, MAC address, watchdog and the like; the lab itself fills in channels and ports."""
-        self._board = board
-        self._image = image
-        self._options = options or qemu.Options()
+        self.board = board
+        self.image = image
+        self.options = options or qemu.Options()
         self._card_bytes = card_bytes
         self._emulator: Emulator | None = None
         self._last_words = "it has not been powered on"
         self._powered_on: float | None = None
+        self.restored = False
+        """Whether it goes on from a saved state, not from a boot."""
         directory.mkdir(parents=True, exist_ok=True)
         self.directory = directory
         if capture:
-            self._options = replace(self._options, capture=directory / "wire.pcap")
+            self.options = replace(self.options, capture=directory / "wire.pcap")
         self._overlay = directory / "card.qcow2"
         self._steps = Steps(directory / "steps.log")
         self.console = SerialConsole(directory / "console.log", self._explain)
@@ -59,7 +69,7 @@ class Guest:
 
     @property
     def name(self) -> str:
-        return self._options.name
+        return self.options.name
 
     @property
     def processor_s(self) -> float:
@@ -72,22 +82,27 @@ class Guest:
         """Start QEMU but let no instruction run: the moment to open `port()`s whose first byte matters."""
         if self._emulator and self._emulator.running:
             return
-        self._forget()
         if not self._overlay.exists():
-            qemu.make_overlay(self._image, self._overlay, self._card_bytes)
+            qemu.make_overlay(self.image, self._overlay, self._card_bytes)
+        self._start()
+
+    def _start(self, *more: str) -> None:
+        """Start QEMU, with `more` arguments."""
+        self._forget()
         ours, theirs = socket.socketpair()
-        ports = dict.fromkeys(qemu.port_ids(self._board), qemu.tcp_socket())
+        ports = dict.fromkeys(qemu.port_ids(self.board), qemu.tcp_socket())
         options = replace(
-            self._options,
+            self.options,
             console=qemu.inherited_socket(theirs.fileno()),
-            ports={**ports, **self._options.ports},
+            ports={**ports, **self.options.ports},
             paused=True,
+            extra=(*self.options.extra, *more),
         )
         with contextlib.ExitStack() as on_failure:
             on_failure.callback(ours.close)
             with theirs:
                 self._emulator = Emulator(
-                    lambda qmp: qemu.command_line(self._board, self._overlay, replace(options, qmp=qmp)),
+                    lambda qmp: qemu.command_line(self.board, self._overlay, replace(options, qmp=qmp)),
                     self.directory,
                     inherited=[theirs.fileno()],
                 )
@@ -146,6 +161,34 @@ class Guest:
 
     # What only an emulator can do
 
+    def save(self, directory: Path) -> None:
+        """Put the running machine with its card into files, from which `restore` makes others; this one goes on."""
+        self._steps.note("saved")
+        self.execute("stop")
+        self.execute("migrate-set-parameters", max_bandwidth=_STATE_BYTES_S)
+        self._migrate("migrate", f"exec:cat >{shlex.quote(str(directory / _SAVED_MACHINE))}")
+        shutil.copyfile(self._overlay, directory / _SAVED_CARD)  # which nobody writes to before it goes on
+        self.execute("cont")
+
+    def restore(self, directory: Path) -> None:
+        """Go on from where a machine of the same options and card was saved. It was never switched on, so its console
+        has said nothing; afterwards it is a guest like any other."""
+        self._overlay.unlink(missing_ok=True)
+        qemu.make_overlay(directory / _SAVED_CARD, self._overlay, below="qcow2")
+        self._start("-incoming", "defer")
+        self._migrate("migrate-incoming", f"exec:cat {shlex.quote(str(directory / _SAVED_MACHINE))}")
+        self._steps.note("restored")
+        self._powered_on = time.monotonic()
+        self.restored = True
+        self.execute("cont")
+
+    def _migrate(self, command: str, uri: str) -> None:
+        self.execute("migrate-set-capabilities", capabilities=[{"capability": "events", "state": True}])
+        self.execute(command, uri=uri)
+        while (status := self.wait_event("MIGRATION", _STATE_SECONDS)["data"]["status"]) != "completed":
+            if status == "failed":
+                raise LabError(f"{self.name}: {command}: {self.execute('query-migrate').get('error-desc', status)}")
+
     def execute(self, command: str, **arguments: object) -> Any:
         """A QMP command."""
         return self._running().execute(command, **arguments)
@@ -163,7 +206,7 @@ class Guest:
 
     def port_url(self, name: str) -> str:
         """Where the other end of a serial connector is, for pyserial; one client at a time. Changes at power on."""
-        identifier = qemu.port_ids(self._board)[name]
+        identifier = qemu.port_ids(self.board)[name]
         return f"socket://127.0.0.1:{self._running().sockets()[identifier]}"
 
     def port(self, name: str, timeout: float = 600) -> serial.SerialBase:
@@ -172,7 +215,7 @@ class Guest:
 
     def ssh_port(self) -> int:
         """The loopback port that leads to the guest's SSH; only with a `UserLink`."""
-        link = self._options.link
+        link = self.options.link
         if not isinstance(link, qemu.UserLink):
             raise LabError(f"{self.name} is not on a network of its own: ask its segment for the port")
         return self._running().forwards()[str(link.guest)]
@@ -187,6 +230,7 @@ class Guest:
 
     def _forget(self) -> None:
         """End QEMU if it is there, and take in the last words of its console."""
+        self.restored = False
         self._powered_on = None if self._emulator is None else self._powered_on
         if self._emulator:
             self._emulator.kill()

@@ -194,14 +194,15 @@ def find_tool(name: str) -> str:
     return found
 
 
-def make_overlay(image: Path, overlay: Path, size: int = 0) -> None:
+def make_overlay(image: Path, overlay: Path, size: int = 0, below: Literal["raw", "qcow2"] = "raw") -> None:
     """Make the throw-away layer that takes the guest's writes, so that the image never changes.
 
-    `size`: bytes of the card, when it is larger than the image, as real cards are.
+    `size`: bytes of the card, when it is larger than the image, as real cards are. `below`: the image's format; an
+    overlay's card is as large as it was.
     """
-    size = max(size, image.stat().st_size)
-    argv = [find_tool("qemu-img"), "create", "-q", "-f", "qcow2", "-F", "raw", "-b", str(image.resolve())]
-    argv += [str(overlay), str(-(-size // 512) * 512)]
+    argv = [find_tool("qemu-img"), "create", "-q", "-f", "qcow2", "-F", below, "-b", str(image.resolve()), str(overlay)]
+    if below == "raw":
+        argv += [str(-(-max(size, image.stat().st_size) // 512) * 512)]
     progress.command(argv)
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     if done.returncode:

@@ -45,6 +45,8 @@ class Ssh:
         self._port = port
         self._master: subprocess.Popen[str] | None = None
         self._root: subprocess.Popen[str] | None = None
+        self.first_connected: float | None = None
+        """When (`time.monotonic()`) the first connection stood."""
 
     def __enter__(self) -> Ssh:
         return self
@@ -58,6 +60,7 @@ class Ssh:
         while not deadline.expired:
             reason = self._try_to_connect(deadline)
             if reason is None:
+                self.first_connected = self.first_connected or time.monotonic()
                 return
             if any(phrase in reason for phrase in HOPELESS):
                 raise LabError(f"{self._robot.name}: SSH refused: {reason}")

@@ -29,7 +29,7 @@ from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet, Health, Robot
 from flotilla.robot import ssh
 from images.builder.build import build, image_of
-from lab.qemu import holder
+from lab.qemu import holder, saved
 from lab.qemu.guest import Guest
 from lab.qemu.radio_segment import segment_of
 from lab.qemu.segment import Segment
@@ -44,7 +44,6 @@ INVENTORY = DIRECTORY / "inventory"
 _LOCK = DIRECTORY / "lock"
 """Locked by the process that holds the fleet, whose number stands in it: without the lock, all here is left behind."""
 _LOG = DIRECTORY / "log"
-BOOT_SECONDS = 900
 DOWN_SECONDS = 300
 _ANSWER_SECONDS = 300
 """Of one guest to `make fleet-status`."""
@@ -85,7 +84,7 @@ def running(
     fleet: Fleet, robots: Sequence[Robot], directory: Path, ports: Mapping[str, Mapping[str, str]] | None = None,
     images: Path = paths.IMAGES,
 ) -> Iterator[tuple[dict[str, Guest], Segment]]:  # fmt: skip
-    """The robots as guests on one segment with the station, switched on, by name; not yet booted.
+    """The robots as guests on one segment with the station, started, by name; `saved.wait` waits for each.
 
     `ports`: by the robot's name, its `qemu.Options.ports`.
     """
@@ -96,7 +95,7 @@ def running(
             options = replace(segment.options(robot), ports=(ports or {}).get(robot.name, {}))
             guest = Guest(fleet.boards[robot.board], image_of(robot, images), directory / robot.name, options)
             guests[robot.name] = stack.enter_context(guest)
-            guest.on()
+            saved.start(guest)
         yield guests, segment
 
 
@@ -199,9 +198,8 @@ def hold(count: int, link: str | None = None) -> None:
         guests, segment = stack.enter_context(running(fleet, robots, DIRECTORY, images=images))
         ports = {robot.name: segment.ssh_port(robot.address) for robot in robots}
         for robot in robots:
-            guests[robot.name].console.expect(rf"{robot.name} login: ", BOOT_SECONDS)
             with Ssh(robot, "127.0.0.1", functools.partial(ports.__getitem__, robot.name)) as shell:
-                shell.connect()
+                saved.wait(guests[robot.name], robot, shell)
             stack.enter_context(ssh.announced(robot, ports[robot.name]))
             print(robot.name, flush=True)
         stack.callback(GUESTS.unlink, missing_ok=True)

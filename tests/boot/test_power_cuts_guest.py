@@ -15,8 +15,9 @@ from lab.power_cuts.crash_states import CrashState, all_states
 from lab.power_cuts.replay import POWER_ONS, Recording, replay
 from lab.power_cuts.timeline import Timeline
 from lab.power_cuts.write_log import WriteLog
+from lab.qemu.saved import BOOT_SECONDS
 from tests.boot.guests import PENTIUM, SECONDS, boot_state, sh
-from tests.conftest import BOOT_SECONDS, GuestFactory
+from tests.conftest import GuestFactory
 from tests.figures import PROPERTY
 
 BOOTS_OF_A_PHASE = 2

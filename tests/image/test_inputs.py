@@ -80,7 +80,7 @@ def test_planted_files_are_in_the_image_and_counted_or_neither(tmp_path: Path, f
     toolset = tools.Tools(tools.tree(read_lock("tools")), 0)
     (new,) = (root for root in (own / "cache").glob("rootfs-*") if not (paths.CACHE / root.name).exists())
     listing = toolset.run("usr/bin/unsquashfs", "-l", "-d", "", new / "root.squashfs").splitlines()
-    (real_root,) = (root for root in paths.CACHE.glob("rootfs-*") if _holds(root, first))
+    real_root = next(root for root in paths.CACHE.glob("rootfs-*") if _holds(root, first))
     before = toolset.run("usr/bin/unsquashfs", "-l", "-d", "", real_root / "root.squashfs").splitlines()
     inside = "/" + UNTRACKED.removeprefix("rootfs_overlay/")
     assert sorted(set(listing) ^ set(before)) == [str(Path(inside).parent), inside]

@@ -24,6 +24,7 @@ import yaml
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.robot import ssh
+from lab.qemu import saved
 from lab.qemu import virtual_fleet as virtual
 from lab.qemu.guest import Guest
 from lab.qemu.ssh import Ssh
@@ -113,10 +114,9 @@ def running(fleet: Fleet, robots: list[Robot], directory: Path, **plugged: Mappi
         ports = {robot.name: segment.ssh_port(robot.address) for robot in robots}
         shells = {}
         for robot in robots:
-            machines[robot.name].console.expect(rf"{robot.name} login: ", BOOT_SECONDS)
             port = functools.partial(ports.__getitem__, robot.name)
             shells[robot.name] = stack.enter_context(Ssh(robot, "127.0.0.1", port))
-            shells[robot.name].connect()
+            saved.wait(machines[robot.name], robot, shells[robot.name])
         yield Guests({robot.name: robot for robot in robots}, machines, shells, ports, directory)
 
 
