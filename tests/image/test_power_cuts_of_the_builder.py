@@ -64,6 +64,7 @@ class Disk:
         return done.stdout
 
     def snapshot(self, moment: str) -> None:
+        moment = f"{len(self.snapshots) + 1}: {moment}"  # two results of a kind are two moments
         if len(self.snapshots) % 2:  # another program syncs a file of its own: names get to the disk, contents do not
             (self.seen / "another").touch()
             self.run("sync", self.place / "another")
@@ -146,7 +147,7 @@ def _watch(disk: Disk, build: subprocess.Popen[str]) -> None:
                 known |= names
                 due = time.monotonic() + BETWEEN_S
             elif time.monotonic() > due:
-                disk.snapshot(f"{BETWEEN_S} s after that, number {len(disk.snapshots)}")
+                disk.snapshot(f"{BETWEEN_S} s after that")
                 due = float("inf")
     finally:
         os.close(descriptor)
