@@ -215,7 +215,7 @@ ifneq ($(checked),)
 	$(Q)MAKEFLAGS= $(cost) lint $(MAKE) --no-print-directory lint
 	$(Q)MAKEFLAGS= $(cost) check-runtime $(MAKE) --no-print-directory check-runtime
 	@# With a seed, so that whoever changed nothing finds nothing.
-	$(Q)MAKEFLAGS= $(cost) fuzz $(MAKE) --no-print-directory fuzz SECONDS=3 SEED=1
+	$(if $(TIER),$(Q)MAKEFLAGS= $(cost) fuzz $(MAKE) --no-print-directory fuzz SECONDS=3 SEED=1)
 endif
 	$(if $(filter unit runtime,$(TIER)),,$(Q)$(cost) images $(FLOTILLA) image --all)
 	$(Q)nice -n 10 $(run_tests) -m '$(selected) and not clock' -n 3

@@ -36,12 +36,12 @@ def named() -> Mapping[str, Sequence[str]]:
 
 
 def stays(nodeid: str, names: Collection[str] | None = None) -> bool:
-    """Whether suite.yml names the test, its function or its file, or it needs no guest."""
+    """Whether suite.yml names it (the test, its function, its file, its file with parameters), or it needs no guest."""
     names = names if names is not None else {name for area in named().values() for name in area}
     test = nodeid.removeprefix("tests/")
-    return tier(nodeid) != "boot" or any(
-        name in names for name in (test, test.partition("[")[0], test.partition("::")[0])
-    )
+    function, bracket, parameters = test.partition("[")
+    file = function.partition("::")[0]
+    return tier(nodeid) != "boot" or any(name in names for name in (test, function, file, file + bracket + parameters))
 
 
 def by_cost(nodeids: Iterable[str]) -> dict[str, float]:

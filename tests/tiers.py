@@ -1,11 +1,12 @@
 """pytest plugin: a test's tier is its folder's, and which tests go to one of several processes.
 
-The tests of a file share what is dear to make, such as a guest, so a file goes to one process; a folder named `shared`
-does as a whole.
+The tests of a file share what is dear to make, such as a guest, so a file goes to one process. Those of a folder named
+`shared` share its guests: what each guest is asked goes to one process.
 """
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -19,6 +20,12 @@ SAME_PLACE = {"test_manual.py": "tests/provisioning/test_fleet.py"}
 """Files that come after another in its process: both play fleet.yml, whose report lies at one place."""
 
 
+_GUEST = re.compile(r"\[(?:.*-)?([a-z0-9_]+-(?:debian|lean))(?:-.*)?\]$")
+"""What tests/boot/shared/conftest.py calls a board with a kernel, among a test's parameters."""
+_SHARED = "smartcoret3-debian"
+"""Of these the one that tests without such a parameter ask."""
+
+
 def tier(nodeid: str) -> str:
     """Of a test's folder."""
     return TIERS[nodeid.split("/")[1]]
@@ -28,7 +35,10 @@ def together(nodeid: str) -> str:
     """What goes to one process."""
     path = nodeid.partition("::")[0]
     folder, _, file = path.rpartition("/")
-    return folder if folder.endswith("/shared") else SAME_PLACE.get(file, path)
+    if not folder.endswith("/shared"):
+        return SAME_PLACE.get(file, path)
+    guest = _GUEST.search(nodeid)
+    return f"{folder} {guest[1] if guest else _SHARED}"
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -140,6 +140,7 @@ def test_an_interrupted_build_leaves_the_last_good_image_and_nothing_else(
     assert not list((build / "cache").glob("rootfs-*"))
 
 
+@pytest.mark.nightly  # it is interrupted each time
 def test_a_killed_build_leaves_no_process_and_no_result(build: Path, running: subprocess.Popen[str]) -> None:
     pids = _processes(build)
     running.kill()
@@ -245,11 +246,13 @@ def test_three_builds_at_once_make_the_right_image(build: Path, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("room", "fill", "message"),
     [
-        ("100m", "", "a build needs 908.0 MiB"),
-        ("1200m", f"(for _ in $(seq 600); do [ ! -s $BUILD/rootfs-{BOARD}.log ] || break; sleep 0.1; done; "
-         "dd if=/dev/zero of=$BUILD/filler bs=1M 2>/dev/null) &", "no space left"),
+        pytest.param("100m", "", "a build needs 908.0 MiB", id="from the start"),
+        pytest.param(
+            "1200m", f"(for _ in $(seq 600); do [ ! -s $BUILD/rootfs-{BOARD}.log ] || break; sleep 0.1; done; "
+            "dd if=/dev/zero of=$BUILD/filler bs=1M 2>/dev/null) &", "no space left", id="while building",
+            marks=pytest.mark.nightly,  # each write that finds no room is said by tests/unit/test_host.py
+        ),
     ],
-    ids=["from the start", "while building"],
 )  # fmt: skip
 def test_a_full_disk_is_said_so(build: Path, tmp_path: Path, room: str, fill: str, message: str) -> None:
     """A disk that is too small from the start, and one that something else fills while the build runs."""

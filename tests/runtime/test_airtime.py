@@ -34,7 +34,10 @@ from tests.airtime import Station
 from tests.runtime.test_slot import partition_table
 from tests.runtime.test_update import CHUNK, header_of, manifest_of, pack
 
-pytestmark = pytest.mark.clock  # what overflows a receiver's socket on a busy computer would be sent again
+pytestmark = [
+    pytest.mark.clock,  # what overflows a receiver's socket on a busy computer would be sent again
+    pytest.mark.nightly,  # each time, test_multicast.py sends to eight robots, test_update.py writes what they got
+]
 
 ROBOTS = 8
 SECONDS = 900

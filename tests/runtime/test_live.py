@@ -139,6 +139,7 @@ def test_a_client_gets_what_was_sent(fleet: Path) -> None:
     assert f"{TOPIC}: {taken}" in said, "the first one is answered by a challenge"
 
 
+@pytest.mark.nightly  # what other programs must not be disturbed by; the page's own clients are tried each time
 def test_slow_and_vanished_clients_disturb_nobody(fleet: Path, tmp_path: Path) -> None:
     """Neither the recording of the same messages, nor another client. Seen to fail with one sink served, not both."""
     out = tmp_path / "a.mcap"

@@ -27,7 +27,8 @@ def test_what_is_named_is_there() -> None:
     """Or a test that was renamed would leave `make test`, and nobody notice. A parameter is checked when it is run."""
     for names in suite.named().values():
         for name in names:
-            path, _, function = name.partition("::")
+            file, _, function = name.partition("::")
+            path = file.partition("[")[0]
             assert tiers.tier(f"tests/{path}") == "boot", f"suite.yml: {name} needs no guest, so it runs anyway"
             assert (TESTS / path).is_file(), f"suite.yml: {name}: there is no such file"
             assert not function or function.partition("[")[0] in functions(TESTS / path), f"suite.yml: no test {name}"
@@ -48,14 +49,15 @@ def test_no_area_is_left_without_a_test() -> None:
         ("tests/boot/test_b.py::test_two", False),
         ("tests/boot/test_c.py::test_one[x/y-z]", True),
         ("tests/boot/test_c.py::test_one[z]", False),
+        ("tests/boot/test_d.py::test_one[x]", True),
+        ("tests/boot/test_d.py::test_one[y]", False),
         ("tests/provisioning/test_a.py::test_one", False),
         ("tests/unit/test_any.py::test_one", True),
     ],
 )
 def test_of_tests_that_need_guests_those_stay_that_are_named(nodeid: str, stays: bool) -> None:
-    assert (
-        suite.stays(nodeid, ["boot/test_a.py", "boot/test_b.py::test_one", "boot/test_c.py::test_one[x/y-z]"]) == stays
-    )
+    names = ["boot/test_a.py", "boot/test_b.py::test_one", "boot/test_c.py::test_one[x/y-z]", "boot/test_d.py[x]"]
+    assert suite.stays(nodeid, names) == stays
 
 
 @pytest.mark.parametrize("count", [1, 3, 8])

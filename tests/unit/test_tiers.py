@@ -8,13 +8,26 @@ from tests import tiers
 TESTS = paths.PROJECT / "tests"
 
 
-def test_a_folder_named_shared_goes_to_one_process_and_other_files_each_to_one() -> None:
-    first, second, alone = (
-        tiers.together(f"tests/boot/{file}::test_a[b/c]")
-        for file in ("shared/test_boot.py", "shared/test_dds.py", "test_latency.py")
+def test_what_a_shared_guest_is_asked_goes_to_one_process_and_other_files_each_to_one() -> None:
+    def together(*tests: str) -> int:
+        """In how many processes."""
+        return len({tiers.together(f"tests/boot/{test}") for test in tests})
+
+    assert (
+        together("shared/test_boot.py::test_a[x86_64-debian]", "shared/test_dds.py::test_b[a/b-x86_64-debian-c]") == 1
     )
-    assert first == second != alone
-    assert alone != tiers.together("tests/boot/test_lab.py::test_a")
+    assert (
+        together("shared/test_boot.py::test_a[smartcoret3-debian]", "shared/test_dds.py::test_b", "shared/a.py::b[3]")
+        == 1
+    )
+    assert (
+        together("shared/test_boot.py::test_a[x86_64-debian]", "shared/test_boot.py::test_a[smartcoret3-debian]") == 2
+    )
+    assert (
+        together("shared/test_boot.py::test_a[smartcoret3-lean]", "shared/test_boot.py::test_a[smartcoret3-debian]")
+        == 2
+    )
+    assert together("test_latency.py::test_a[b/c]", "test_latency.py::test_b", "test_lab.py::test_a") == 2
 
 
 def test_what_is_named_is_there_and_each_folder_has_a_tier() -> None:

@@ -1,19 +1,16 @@
 """Guests that all tests of this folder share, and what is measured on them.
 
 Checks that any robot must pass run on one guest of each board and kernel; what only one board has, on that board's.
-Every measure of time is printed and put into `build/reports/boot.json`; none is judged, because the host is shared. All
-tests of this folder run in one process, so that each guest boots once.
+Every measure of time is printed; none is judged, because the host is shared. What a guest is asked runs in one process,
+so that it boots once.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
-from flotilla.common import paths
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board
 from images.builder import card, kernel
@@ -36,34 +33,23 @@ SYSTEMS = [
 
 
 class Report:
-    """Figures by board: into a file, and, with the test that measured them, to the end of the run."""
+    """Figures of guests, for the test that measured them."""
 
     def __init__(self) -> None:
-        self.figures: dict[str, dict[str, float]] = {}
         self._new: list[str] = []
 
     def add(self, board: str, **figures: float) -> None:
-        rounded = {name: round(value, 2) for name, value in figures.items()}
-        self.figures.setdefault(board, {}).update(rounded)
-        self._new += [f"{board}: {name} {value:g}" for name, value in rounded.items()]
+        self._new += [f"{board}: {name} {value:.4g}" for name, value in figures.items()]
 
     def take(self) -> list[str]:
         """What was added since the last call, a line each."""
         new, self._new = self._new, []
         return new
 
-    def write(self, file: Path) -> None:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside = file.with_name(f".{file.name}.new")
-        beside.write_text(json.dumps(self.figures, indent=1, sort_keys=True) + "\n")
-        beside.rename(file)
-
 
 @pytest.fixture(scope="session")
-def report() -> Iterator[Report]:
-    report = Report()
-    yield report
-    report.write(paths.BUILD / "reports" / "boot.json")
+def report() -> Report:
+    return Report()
 
 
 @pytest.fixture(autouse=True)
