@@ -30,10 +30,11 @@ DRIFT = {
     "rm /etc/chrony/chrony.conf": "/etc/chrony/chrony.conf is missing",
     "rm -r /etc/systemd/system/multi-user.target.wants": "multi-user.target.wants was removed",
     "sysctl -q kernel.panic=0": "kernel.panic = 0, not 10",
-    "nft flush ruleset": "the rules in force are others",
     "systemctl stop nftables": "nftables.service does not run",
 }
 """What drifts on robot 2, and how the report names it."""
+OF_ANOTHER = {"nft flush ruleset": "the rules in force are others"}
+"""On robot 3: where the firewall's service starts again, it loads the rules, whatever their role does."""
 
 
 @pytest.fixture(autouse=True)
@@ -57,8 +58,10 @@ def test_growth_is_measured_and_nothing_stays() -> None:
     assert left() == before
 
 
-def test_drift_of_one_is_found_and_mended(fleet: Fleet, tmp_path: Path) -> None:
-    """The first run also shows that a run which changed a robot is refused."""
+def test_drift_is_found_and_mended(fleet: Fleet, tmp_path: Path) -> None:
+    """The first run also shows that a run which changed a robot is refused.
+
+    Seen to pass, when all drift was one robot's, with a role of the firewall that did nothing."""
     directory = scale.describe(4, fleet.robots[4].board, tmp_path / "inventory")
     image = scale.image_for(fleet, fleet.robots[4].board)
     module = "tests.provisioning.test_fleet_scale"
@@ -68,12 +71,13 @@ def test_drift_of_one_is_found_and_mended(fleet: Fleet, tmp_path: Path) -> None:
     names = [f"robot{number}" for number in range(1, 5)]
     outcomes = [{name: robot["outcome"] for name, robot in run.items()} for run in (first, second)]
     assert outcomes == [
-        dict.fromkeys(names, "up to date") | {"robot2": "changed"},
+        dict.fromkeys(names, "up to date") | {"robot2": "changed", "robot3": "changed"},
         dict.fromkeys(names, "up to date"),
     ]
-    for words in DRIFT.values():
-        assert any(words in line for line in first["robot2"]["repaired"]), (words, first["robot2"]["repaired"])
-    assert "robot2" in refused
+    for name, drift in (("robot2", DRIFT), ("robot3", OF_ANOTHER)):
+        for words in drift.values():
+            assert any(words in line for line in first[name]["repaired"]), (words, first[name]["repaired"])
+        assert name in refused
     assert "robot1" not in refused
 
 
@@ -126,13 +130,14 @@ def left() -> set[str]:
 
 
 def main(directory: Path, image: Path, log: Path) -> None:
-    """In namespaces: let robot 2 drift, play twice; print what was refused of the first run, and both reports."""
+    """In namespaces: let two robots drift, play twice; print what was refused of the first run, and both reports."""
     fleet = inventory.load_fleet(directory)
     robots = list(fleet.robots.values())
     container.boot(fleet, robots, image, log)
-    with Ssh(fleet.robots[2], str(fleet.robots[2].address)) as shell:
-        for script in DRIFT:
-            shell.run(["sudo", "sh", "-ec", script])
+    for number, drift in ((2, DRIFT), (3, OF_ANOTHER)):
+        with Ssh(fleet.robots[number], str(fleet.robots[number].address)) as shell:
+            for script in drift:
+                shell.run(["sudo", "sh", "-ec", script])
     first = scale.play([directory])
     try:
         first.check_unchanged([robot.name for robot in robots])

@@ -15,7 +15,7 @@ from ansible.errors import AnsibleActionFail
 from ansible.plugins.action import ActionBase
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
-from flotilla.robot import provision, release
+from flotilla.robot import answers, provision, release
 from flotilla.updates import multicast, staging
 
 BATCH_BYTES = 8 << 20
@@ -178,8 +178,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             return None
         if not (file := self._run(f"{RECEIVE} end").strip()):
             return None
-        told: dict[str, Any] = json.loads(self._run(f"{UPDATE} {shipment['command']} <{shlex.quote(file)}"))
-        return told
+        return self._told(self._run(f"{UPDATE} {shipment['command']} <{shlex.quote(file)}"))
 
     def _lack(self) -> staging.Lack:
         asked = self._task.args["asked"]
@@ -199,7 +198,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         return {"changed": True, "told": self._run("flotilla-slot confirm")}
 
     def _back(self) -> dict[str, Any]:
-        state = json.loads(self._run("flotilla-slot show"))
+        state = answers.judged(self._name, _parsed(self._run("flotilla-slot show")), answers.Release)
         other = "B" if state["running"] == "A" else "A"
         if not state["slots"][other]["ok"]:
             raise AnsibleActionFail(f"slot {other} holds no release that worked: there is nothing to go back to")
@@ -222,16 +221,26 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         self._display.display(line)
 
     def _update(self, command: str, content: bytes | None = None) -> dict[str, Any]:
-        told: dict[str, Any] = json.loads(self._run(f"{UPDATE} {command}", content))
-        return told
+        return self._told(self._run(f"{UPDATE} {command}", content))
+
+    def _told(self, said: str) -> dict[str, Any]:
+        return answers.judged(self._name, _parsed(said), answers.Told)
 
     def _run(self, command: str, content: bytes | None = None) -> str:
         """What a command says on the robot."""
         done = self._low_level_execute_command(command, in_data=content)
         if done["rc"]:
             said = done["stderr"].strip().splitlines() or done["stdout"].strip().splitlines() or ["nothing"]
-            raise AnsibleActionFail(f"{command}: {said[-1]}")
+            raise AnsibleActionFail(f"{command}: {answers.shown(said[-1])}")
         return str(done["stdout"])
+
+
+def _parsed(said: str) -> object:
+    """JSON; what is none is as wrong as another answer."""
+    try:
+        return json.loads(said)
+    except (ValueError, RecursionError):
+        return None
 
 
 def _kbit_s(value: object) -> int:

@@ -9,9 +9,11 @@ import base64
 from pathlib import Path
 from typing import Any
 
+from ansible.errors import AnsibleActionFail
+
 from ansible.plugins.action import ActionBase
 from flotilla.apps import assigned
-from flotilla.robot import provision
+from flotilla.robot import answers, provision
 
 PRIVATE = "(private)\n"
 
@@ -41,6 +43,8 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         fleet, robot = provision.robot(*place)
         built = assigned.built(fleet, [robot])[robot.name]
         files = provision.files(*place, built)
+        if unknown := [found["path"] for found in drift if found["action"] == "write" and found["path"] not in files]:
+            raise AnsibleActionFail(f"{robot.name} asks for {', '.join(unknown)}, which it should not have")
         result["diff"] = [
             {
                 "before_header": f"{found['path']} {found['why']}",
@@ -65,7 +69,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         arguments["before"] = []
         if self._task.args.get("apps"):
             arguments["before"] = assigned.repairs(task_vars["robot"]["app_actions"], built)
-        result |= self._execute_module("robot_files", arguments, task_vars=task_vars)
+        result |= answers.outcome(self._execute_module("robot_files", arguments, task_vars=task_vars))
         return result
 
 

@@ -10,7 +10,7 @@ from ansible.errors import AnsibleActionFail
 from ansible.plugins.action import ActionBase
 from flotilla.apps import assigned
 from flotilla.common.errors import UserError
-from flotilla.robot import apps, health, provision, release, state
+from flotilla.robot import answers, apps, health, provision, release, state
 
 
 class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
@@ -36,23 +36,27 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             arguments = state.arguments(place[0], fleet, robot, built, policy)
         except UserError as error:
             raise AnsibleActionFail(str(error)) from error
-        result: dict[str, Any] = self._execute_module("robot_state", arguments, task_vars=task_vars)
-        if "state" in result:
-            found = result["state"]
-            wanted = state.wanted(fleet, robot)
-            for file in found["drift"]:
-                file["role"] = provision.role_of(file["path"])
-            judged = apps.judge(robot.number, found["apps"], built)
-            faults = state.faults(found, wanted) | {"apps": judged.faults}
-            if judged.notes:
-                result["warnings"] = [f"{robot.name}: {note}" for note in judged.notes]
-            result |= {
-                "wanted": wanted,
-                "faults": faults,
-                "app_actions": judged.actions,
-                "by_hand": judged.notes,
-                "up_to_date": not found["drift"] and not any(faults.values()),
-                "unhealthy": health.complaints(found["tasks"], policy),
-                "release_drift": state.release_drift(found["release"], release.wanted(robot)),
-            }
-        return result
+        answer = self._execute_module("robot_state", arguments, task_vars=task_vars)
+        if "state" not in answer:
+            return answers.outcome(answer)
+        try:
+            found = answers.judged(robot.name, answer["state"], answers.State)
+        except UserError as error:
+            raise AnsibleActionFail(str(error)) from error
+        wanted = state.wanted(fleet, robot)
+        for file in found["drift"]:
+            file["role"] = provision.role_of(file["path"])
+        judged = apps.judge(robot.number, found["apps"], built)
+        faults = state.faults(found, wanted) | {"apps": judged.faults}
+        return {
+            "changed": False,
+            "state": found,
+            "wanted": wanted,
+            "faults": faults,
+            "app_actions": judged.actions,
+            "by_hand": judged.notes,
+            "warnings": [f"{robot.name}: {note}" for note in judged.notes],
+            "up_to_date": not found["drift"] and not any(faults.values()),
+            "unhealthy": health.complaints(found["tasks"], policy),
+            "release_drift": state.release_drift(found["release"], release.wanted(robot)),
+        }
