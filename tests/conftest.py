@@ -68,7 +68,7 @@ class RobotGuest:
 
     def wait_booted(self, timeout: float = BOOT_SECONDS) -> None:
         """Wait for the login prompt of a boot that was started by `machine.on()`, `machine.reset()` or the guest."""
-        self.machine.console.expect(rf"{self.robot.name} login: ", timeout)
+        saved.await_login(self.machine, self.robot, timeout)
         self.shell.connect()
 
 

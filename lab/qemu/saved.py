@@ -18,6 +18,7 @@ from flotilla.fleet.model import Robot
 from lab.qemu import qemu
 from lab.qemu.guest import Guest
 from lab.qemu.ssh import Ssh
+from lab.qemu.timing import LabError
 
 BOOT_SECONDS = 1200
 """Until the login prompt. Some 30 s on an idle host; the limit only has to be finite, and generous to a busy one."""
@@ -46,13 +47,20 @@ def wait(guest: Guest, robot: Robot, shell: Ssh) -> None:
     if guest.restored:
         shell.script(f"date --set=@{time.time()}")
         return
-    guest.console.expect(rf"{robot.name} login: ", BOOT_SECONDS)
+    await_login(guest, robot)
     shell.connect()
     shell.script("systemctl is-system-running --wait", check=False)
     if not cache.has(_KIND, key := _key(guest)):
         shell.hang_up()  # its connection would be a restored guest's too
         cache.result(_KIND, key, guest.save)
         shell.connect()
+
+
+def await_login(guest: Guest, robot: Robot, timeout: float = BOOT_SECONDS) -> None:
+    """Until the console asks who logs in; LabError where it has another name than the robot's."""
+    name = guest.console.expect(r"(\S+) login: ", timeout)[1]
+    if name != robot.name:
+        raise LabError(f"{robot.name} has booted, and calls itself {name}")
 
 
 def _key(guest: Guest) -> str:

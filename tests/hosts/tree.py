@@ -84,10 +84,11 @@ class Tree:
     def give(self, files: Iterable[Path], directory: str, user: str) -> None:
         """Copy files to a directory there, as the user's own."""
         target = self.path(directory)
+        new = next(path for path in [*reversed(target.parents), target] if not path.exists() or path == target)
         target.mkdir(parents=True, exist_ok=True)
         for file in files:
             shutil.copyfile(file, target / file.name)
-        self._must("chown", "-R", f"{user}:{user}", directory)
+        self._must("chown", "-R", f"{user}:{user}", str(Path("/") / new.relative_to(self.path("/"))))
 
     def _must(self, *argv: str) -> None:
         done = self.run(*argv)
