@@ -84,6 +84,11 @@ bool fl_wired(const struct fl_block *block, uint32_t input)
     return block->service->wired[input];
 }
 
+bool fl_given(const struct fl_block *block, uint32_t parameter)
+{
+    return block->service->given[parameter];
+}
+
 void fl_log(struct fl_block *block, const char *format, ...)
 {
     char line[256];

@@ -19,6 +19,7 @@ struct fl_service {
     char failure[FL_FAILURE_BYTES];
     bool ended;      /* by fl_end() */
     bool *wired;     /* which inputs are */
+    bool *given;     /* which parameters the task file sets */
     int priority;    /* SCHED_FIFO of the block's threads; 0: ordinary */
     int patience_ms; /* how long to wait for a device that another process holds */
     int claim_fd;    /* holds the block's device (device.h); below 1: none */

@@ -1,5 +1,7 @@
 #include "parameter.h"
 
+#include "core/service.h"
+
 #include <ctype.h>
 #include <errno.h>
 #include <inttypes.h>
@@ -337,6 +339,7 @@ void parameters_set(struct fl_block *block, const struct raw_value *raw, size_t 
         const size_t default_count = parameter->default_value && *parameter->default_value;
         const struct raw_value default_value = {parameter->name, line, false, default_count,
                                                 (const char **)&parameter->default_value};
+        block->service->given[i] = value != NULL;
         if (value && !value->list && !value->count)
             continue; /* no value; the reader of the file has reported it */
         if (!value && !parameter->default_value)

@@ -6,6 +6,7 @@ All is compiled by this computer's compiler but for the last test, which takes t
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 from pathlib import Path
@@ -44,7 +45,7 @@ STEPS = 23
 
 
 def test_there_are_as_many_as_were_found_and_most_are_accepted() -> None:
-    assert (len(SHAPES), len(ACCEPTED)) == (37, 32)
+    assert (len(SHAPES), len(ACCEPTED)) == (39, 34)
 
 
 @pytest.fixture
@@ -108,7 +109,8 @@ def response(errors: list[float], every: int, parameters: dict[str, object]) -> 
 def test_a_shape_does_what_the_model_does(flotilla_run: Path, work: Path, shape: Shape) -> None:
     """As generated, and with parameters of the task file; two in one task, or the reason why not."""
     blocks = build(shape, work)
-    variants = {"plain": GENERATED} | ({"tuned": OWN} if shape.tunable else {"other": GENERATED})
+    generated = GENERATED | ({"Limit": math.inf} if shape.infinite else {})
+    variants = {"plain": generated} | ({"tuned": OWN} if shape.tunable else {"other": generated})
     texts = [written(name, OWN if name == "tuned" else None) for name in variants]
     command = "out" if shape.io == "custom" else "command"
     groups = [[0], [1]] if shape.once else [[0, 1]]
@@ -155,6 +157,25 @@ def test_a_shape_is_tuned_while_it_runs(flotilla_run: Path, work: Path, shape: S
         done = subprocess.run(param, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stderr
         task.until(lambda row: row["command"] == 2)
+
+
+def test_what_a_model_begins_with_is_shown_and_a_task_file_may_set_what_was_generated(
+    flotilla_run: Path, work: Path
+) -> None:
+    """Seen to fail with each parameter written back in each step: 0, as generated, where the model has infinity."""
+    blocks, control = build(SHAPES["infinite"], work), work / "control"
+    argv: list[str | Path] = [flotilla_run, "--blocks", blocks, "--control", control, "--watch", "model.count"]
+    block = "  model: {type: model, in: {error: 4, rates: [0, 0], enable: 1}}"
+    with running(argv, work / "run.yml", TASK.format(block)) as task:
+        task.until(lambda row: row["count"] > 1)
+        param: list[str | Path] = [flotilla_run.with_name("flotilla-param"), "--control", control, "run"]
+        listed = subprocess.run(param, capture_output=True, text=True, timeout=60, check=True).stdout
+        assert "model.Kp: 2.5, tunable\nmodel.Limit: inf, tunable\n" in listed
+    limited = block.replace("enable: 1}", "enable: 1}, parameters: {Limit: 0}")
+    for text, command in ((block, 10.0), (limited, 0.0)):
+        done = run(flotilla_run, blocks, TASK.format(text), "model.command")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout.splitlines()[0])["model.command"] == command
 
 
 @pytest.mark.parametrize(("name", "said"), REFUSED.items(), ids=REFUSED.keys())

@@ -201,6 +201,10 @@ int fl_add_output(struct fl_block *block, struct fl_port port);
 /* Whether the task file wires an input, which one with FL_OPTIONAL need not be. From `start` on. */
 bool fl_wired(const struct fl_block *block, uint32_t input);
 
+/* Whether the task file sets a parameter, by its place in the type's table; else it has its default. From `start` on.
+ */
+bool fl_given(const struct fl_block *block, uint32_t parameter);
+
 /* CLOCK_MONOTONIC in nanoseconds. */
 int64_t fl_now_ns(void);
 
