@@ -13,6 +13,7 @@ import math
 import re
 import shutil
 import tempfile
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
@@ -50,6 +51,13 @@ _HEADERS = {
     ),
     "stddef.h": "typedef unsigned long size_t;\n",
     "stdbool.h": "#define bool _Bool\n#define true 1\n#define false 0\n",
+    "stdio.h": "typedef struct file FILE;\n",
+    "uchar.h": "typedef unsigned short char16_t;\ntypedef unsigned char32_t;\n",
+    "float.h": "".join(
+        f"#define {kind}_{name} __{kind}_{name}__\n"
+        for kind in ("FLT", "DBL", "LDBL")
+        for name in ("MANT_DIG", "DIG", "EPSILON", "MIN", "MAX", "MIN_EXP", "MAX_EXP")
+    ),
     # By the compiler's own word sizes: generated code compares them with those that it was made for.
     "limits.h": "".join(
         f"#define {name}_MAX __{macro}_MAX__\n#define {name}_MIN (-{name}_MAX - 1)\n"
@@ -61,6 +69,21 @@ _HEADERS = {
     ),
 }  # fmt: skip
 """What the parser sees of the C library; of further headers nothing, since none of their types is a signal's."""
+_EMPTY = (
+    "assert.h", "complex.h", "ctype.h", "errno.h", "fenv.h", "inttypes.h", "iso646.h", "locale.h", "math.h", "setjmp.h",
+    "signal.h", "stdalign.h", "stdarg.h", "stdatomic.h", "stdlib.h", "stdnoreturn.h", "string.h", "tgmath.h",
+    "threads.h", "time.h", "wchar.h", "wctype.h",
+)  # fmt: skip
+"""The other headers of C, which code may ask for in quotes, too."""
+_WITHOUT = (
+    "__attribute__(x)=",
+    "__extension__=",
+    "__inline=inline",
+    "__inline__=inline",
+    "__restrict=",
+    "__volatile__=",
+)
+"""Words of the compiler that the parser does not know, and what stands for them."""
 _ROLES = {
     "model": ("RT_MODEL",),
     "parameters": ("P", "Parameters"),
@@ -82,6 +105,8 @@ _EXPORTED = re.compile(
     r"^[ \t]*extern\s+(?:volatile\s+)?(\w+)\s+(\w+)(\[\d+\])?\s*;\s*/\*\s*(?:(Variable:)|'<Root>/([^'\n]+)')", re.M
 )
 """A variable for a parameter or for a root port, with the coder's comment behind it."""
+_STEP_SIZE = re.compile(r"(?:->|\.)Timing\.stepSize0\s*=\s*\(?([0-9.eE+-]+)\)?\s*;")
+"""The period that the code itself computes with."""
 _BASE_PERIOD = re.compile(r"\bperiod\s+([0-9.eE+-]+)\s+seconds\s+\((?:the model's base sample time|base rate)")
 """What the coder's example of a main program says."""
 _MISSING = re.compile(r"fatal error: ([\w./+-]+): No such file or directory")
@@ -91,7 +116,8 @@ _PACK = f"let MATLAB collect all files with packNGo(buildInfo), and unpack them 
 _ABSENT = {
     **dict.fromkeys(
         ("rtw_continuous.h", "rtw_solver.h", "rt_logging.h", "simstruc.h", "simstruc_types.h", "fixedpoint.h",
-         "tmwtypes.h", "dt_info.h", "ext_work.h", "rtw_extmode.h", "sysran_types.h", "rtw_modelmap.h"),
+         "tmwtypes.h", "dt_info.h", "ext_work.h", "rtw_extmode.h", "sysran_types.h", "rtw_modelmap.h",
+         "solver_zc.h"),
         f"a header of MATLAB's own, which the model's options need; {_PACK}",
     ),
     **dict.fromkeys(
@@ -100,7 +126,25 @@ _ABSENT = {
     ),
 }  # fmt: skip
 """Headers that are no part of generated code, and why it asks for them."""
-_TAKE_APART = "root ports are numbers or vectors of them; take a bus apart in the model"
+_UNKNOWN = (
+    (
+        re.compile(r"(^|/)MW_\w+\.h$"),
+        "of a hardware support package, and drives a board; generate for no hardware board",
+    ),
+    (
+        re.compile(
+            r"(^|/)(rt\w*|rtw_\w+|look\w+|plook\w+|intrp\w+|mul_\w+|div_\w+|\w+_(types|private|data|shared|defines))\.h$"
+        ),
+        f"part of the generated code, as files in slprj/ert/_sharedutils are; {_PACK}",
+    ),
+    (
+        re.compile(""),
+        "neither the coder's nor the C library's, but of code that the model calls (custom code, an S-function); put "
+        f"it and its sources into {GENERATED}/",
+    ),
+)
+"""Reasons for other headers, by their names."""
+_TAKE_APART = "root ports are numbers, vectors of them, or buses of these; give it another type in the model"
 _TAKE_DEFAULT = "leave names of arguments and storage of root ports as the coder has them by default"
 
 
@@ -114,6 +158,8 @@ class Signal:
     width: int
     place: str
     """Where the model has it, as C."""
+    port: str = field(default="", kw_only=True)
+    """Where the whole root port is, of which this is a part: of a bus, all its numbers are ports of the block."""
     rate: int = field(default=0, kw_only=True)
     """Which of the model's threads reads or writes it: 0 is the block's step, others as in `Model.slower`."""
 
@@ -175,8 +221,11 @@ class Model:
     definition: str = ""
     """Of that variable where no file that is compiled has it; else its declaration."""
     steps: list[Step] = field(default_factory=list)
+    begin: str = ""
+    """The function that initializes it."""
+    end: str = ""
     initialize: str = ""
-    """Its arguments; so too of `terminate`."""
+    """Arguments of `begin`; so too `terminate` of `end`."""
     terminate: str | None = None
     error_status: str = ""
     """Where the model says that it failed, as C."""
@@ -255,12 +304,12 @@ def preprocess(generated: Path, model: str, code: Code, system: System) -> str:
         shutil.copytree(generated, work / "source")
         (work / "library").mkdir()
         text = "".join(path.read_text(errors="replace") for path in (work / "source").rglob("*.[ch]"))
-        for name in {*_HEADERS, *re.findall(r"#\s*include\s*<([\w./]+)>", text)}:
+        for name in {*_EMPTY, *_HEADERS, *re.findall(r"#\s*include\s*<([\w./]+)>", text)}:
             (work / "library" / name).parent.mkdir(parents=True, exist_ok=True)
             (work / "library" / name).write_text(_HEADERS.get(name, ""))
         (work / "source" / "flotilla_model.c").write_text(f'#include "{model}.h"\n')
         argv = ["env", "-C", "/out/source", "gcc", "-E", "-P", "-nostdinc", "-I/out/library", "-I."]
-        argv += ["-D__attribute__(x)=", "-o", "/out/model.i", "flotilla_model.c"]
+        argv += [*(f"-D{each}" for each in _WITHOUT), "-o", "/out/model.i", "flotilla_model.c"]
         try:
             runtime.command(work, system, argv)
         except UserError as error:
@@ -273,8 +322,8 @@ def explained(error: UserError, system: System) -> UserError:
     """What the compiler says of generated code, in terms of the coder's options where these are the cause."""
     if missing := _MISSING.search(str(error)):
         header = missing[1]
-        otherwise = f"part of the generated code, as files in slprj/ert/_sharedutils are; {_PACK}"
-        return UserError(f"{GENERATED}/ lacks {header}: it is {_ABSENT.get(Path(header).name, otherwise)}")
+        reason = _ABSENT.get(Path(header).name) or next(why for names, why in _UNKNOWN if names.search(header))
+        return UserError(f"{GENERATED}/ lacks {header}: it is {reason}")
     if size := _WORD_SIZE.search(str(error)):
         remedy = "choose the robot's processor (x86-32 or x86-64, Linux) as hardware implementation"
         return UserError(
@@ -338,16 +387,17 @@ def separate(model: Model, code: Code, *, wanted: bool) -> None:
 
 def _owned(model: Model, signal: Signal, used: list[str], sources: str) -> Signal:
     """The port with the rate whose functions name it."""
-    field_of = re.search(r"\.(\w+)$", signal.place)
-    if signal.place.startswith("instance->arguments.") or not field_of:
-        pattern = rf"(?<![.>\w]){re.escape(signal.place.rpartition('.')[2])}\b"
+    place = signal.port or signal.place
+    field_of = re.search(r"\.(\w+)$", place)
+    if place.startswith("instance->arguments.") or not field_of:
+        pattern = rf"(?<![.>\w]){re.escape(place.rpartition('.')[2])}\b"
     else:
         role = "inputs" if signal in model.inputs else "outputs"
         kinds = "|".join(_ROLES[role])
         # Whatever is of the structure's type: the variable, a pointer to it, an argument.
         names = set(re.findall(rf"\b(?:{kinds})(?:_\w+)?\s*\*?\s*(?:const\s+)?(\w+)\s*[;,)=]", _plain(sources)))
-        if not signal.place.startswith("instance->"):
-            names.add(re.sub(r"\W", "", signal.place.rpartition(".")[0]))
+        if not place.startswith("instance->"):
+            names.add(re.sub(r"\W", "", place.rpartition(".")[0]))
         if not names:
             return signal
         pattern = rf"\b(?:{'|'.join(sorted(names))})\s*(?:\.|->)\s*{re.escape(field_of[1])}\b"
@@ -458,10 +508,12 @@ class _Reader:
         if self.model in self.functions:
             remedy = "unset its option to use dynamic memory allocation for model initialization"
             raise self._no(f"allocates its structures in {self.model}(); {remedy}")
-        functions = self._steps(sample_times_s)
-        names = [f"{self.model}_initialize", *(name for name, _, _ in functions)]
-        if (end := f"{self.model}_terminate") in self.functions:
-            names.append(end)
+        entries = self._entries()
+        functions = self._steps(sample_times_s, entries["step"])
+        found.begin, found.end = entries["initialize"], entries["terminate"]
+        names = [found.begin, *(name for name, _, _ in functions)]
+        if found.end in self.functions:
+            names.append(found.end)
         self._arguments(found, names)
         if "model" in found.members:
             self._pack(found)
@@ -480,16 +532,37 @@ class _Reader:
         self._ports(found)
         if "model" in places and any(path == "errorStatus" for path, _ in self._leaves(self.kinds["model"])):
             found.error_status = f"{places['model']}.errorStatus"
-        found.initialize = self._call(f"{self.model}_initialize", 0)
-        found.terminate = self._call(end, 0) if end in self.functions else None
+        found.initialize = self._call(found.begin, 0)
+        found.terminate = self._call(found.end, 0) if found.end in self.functions else None
         for name, number, every in functions:
             result = self._returned(found, self.functions[name].type)
             given = number if "tid" in self._parameter_names(name) and name.endswith("_step") else None
             found.steps.append(Step(name, self._call(name, number), every, result, given))
         found.period_s = self.period_s
+        for kind, signals in (("input", found.inputs), ("output", found.outputs)):
+            for name, count in Counter(signal.name for signal in signals).items():
+                if count > 1:
+                    raise self._no(f"has {count} {kind}s named {name}, with those of buses; give a port another name")
         return found
 
-    def _steps(self, times_s: list[float]) -> list[tuple[str, int, int]]:
+    def _entries(self) -> dict[str, str]:
+        """Names of the model's functions by what they are for: the coder's, or those that its user has given them."""
+        said = {"initialize": "Initialize model", "step": "Step the model", "terminate": "Terminate model"}
+        section = re.search(r"/\* Model entry point functions \*/(.*?)(?:/\*|#|\Z)", self.code.header, re.S)
+        left = re.findall(r"(\w+)\s*\(", section[1]) if section else []
+        left = [name for name in left if name in self.functions and not re.fullmatch(rf"{self.model}_step\d+", name)]
+        found = {}
+        for role, comment in said.items():
+            called = re.search(rf"/\* {comment}[^*]*\*/\s*(?:[^;=(]*=)?\s*(\w+)\s*\(", self.code.main)
+            names = [f"{self.model}_{role}", called[1] if called else ""]
+            found[role] = next((name for name in names if name in self.functions), names[0])
+        left = [name for name in left if name not in found.values()]
+        unknown = [role for role, name in found.items() if name not in self.functions]
+        if len(left) == 1 and unknown == ["terminate"]:
+            found["terminate"] = left[0]
+        return found
+
+    def _steps(self, times_s: list[float], step: str) -> list[tuple[str, int, int]]:
         """The step functions, each with its rate's number, and how often it runs."""
         sample_times = {
             int(number): float(time)
@@ -497,20 +570,22 @@ class _Reader:
                 rf"\b{self.model}_step(\d+)\s*\([^)]*\)\s*/\*\s*Sample time: \[([0-9.eE+-]+)s,", self.code.sources
             )
         }
-        base = _BASE_PERIOD.search(self.code.main)
+        size = _STEP_SIZE.search(self.code.sources)
+        base = size or _BASE_PERIOD.search(self.code.main)
         numbered = sorted(
             int(match[1]) for name in self.functions if (match := re.fullmatch(rf"{self.model}_step(\d+)", name))
         )
-        single = next((n for n in ("step", "custom") if f"{self.model}_{n}" in self.functions), "")
+        single = next((name for name in (step, f"{self.model}_custom") if name in self.functions), "")
         if numbered:
             names, numbers = [f"{self.model}_step{number}" for number in numbered], numbered
-        elif single and "tid" in self._parameter_names(f"{self.model}_{single}"):
+        elif single and "tid" in self._parameter_names(single):
             numbers = sorted(sample_times) or list(range(len(times_s)))
             names = [f"{self.model}_step"] * len(numbers)
         elif single:
-            names, numbers = [f"{self.model}_{single}"], [0]
+            names, numbers = [single], [0]
         elif f"{self.model}_output" in self.functions and f"{self.model}_update" in self.functions:
             self.period_s = times_s[0] if times_s else float(base[1]) if base else None
+            self._contradiction(times_s, {}, [], base, "Timing.stepSize0" if size else "its main program")
             return [(f"{self.model}_{each}", 0, 1) for each in ("output", "update")]
         else:
             has = ", ".join(sorted(name for name in self.functions)) or "none at all"
@@ -520,6 +595,7 @@ class _Reader:
             times[0] = float(base[1])
         if not times and len(numbers) == 1 and base:
             times = [float(base[1])]
+        self._contradiction(times_s, sample_times, numbers, base, "Timing.stepSize0" if size else "its main program")
         if (len(times) != len(numbers) or 0 in times) and (times_s or len(numbers) != 1):
             remedy = "say sample_times: [0.01, 0.05], fastest first, in seconds"
             known = len([time for time in times if time])
@@ -534,6 +610,22 @@ class _Reader:
             found.append((name, number, every))
         self.period_s = times[0] if times else None
         return found
+
+    def _contradiction(
+        self, times_s: list[float], said: dict[int, float], numbers: list[int], base: re.Match[str] | None, by: str
+    ) -> None:
+        """Refuse sample times other than those that the code was generated for."""
+        known = [
+            (time, said[number], "a comment")
+            for time, number in zip(times_s, numbers, strict=False)
+            if said.get(number)
+        ]
+        if base and times_s:
+            known.append((times_s[0], float(base[1]), by))
+        for time, generated, where in known:
+            if not math.isclose(time, generated, rel_tol=1e-6):
+                message = f"is not what the code was generated for: {where} has {generated:g}"
+                raise self._no(f"sample_times: {time:g}: {message}; leave the key out, or generate for {time:g} s")
 
     def _arguments(self, found: Model, names: list[str]) -> None:
         """Structures and single ports that functions are given."""
@@ -583,39 +675,69 @@ class _Reader:
 
     def _exported(self, found: Model) -> None:
         """Parameters and root ports that are variables."""
-        for kind, name, _, parameter, port in _EXPORTED.findall(self.code.header):
-            number, width = self._number(self.variables[name].type) if name in self.variables else ("", 0)
-            if not number:
-                if port:
-                    raise self._no(f"has a root port {name} of type {kind}; {_TAKE_APART}")
+        plain = _plain(self.code.sources)
+        for _, name, _, parameter, port in _EXPORTED.findall(self.code.header):
+            if name not in self.variables:
                 continue
-            found.shared = found.shared or name
+            node = self.variables[name].type
             if parameter:
-                self._parameter(found, name, name, self.variables[name].type, self.values.get(name))
-            elif re.search(rf"\bInport: '<Root>/{re.escape(port)}'", self.code.sources):
-                found.inputs.append(Signal(_identifier(port) or name, number, width, name))
-            elif re.search(rf"\bOutport: '<Root>/{re.escape(port)}'", self.code.sources):
-                found.outputs.append(Signal(_identifier(port) or name, number, width, name))
+                if self._number(node)[0]:
+                    found.shared = found.shared or name
+                    self._parameter(found, name, name, node, self.values.get(name))
+                continue
+            of = {
+                kind
+                for kind in ("Inport", "Outport")
+                if re.search(rf"\b{kind}: '<Root>/{re.escape(port)}'", self.code.sources)
+            }
+            found.shared = found.shared or name
+            written = re.search(rf"(?<![.>\w]){name}\b[^;{{}}=]*=[^=]", plain)
+            if not of and written:  # a signal within the model, which its user wants to be seen
+                if self._number(node)[0]:
+                    found.outputs += self._spread(name, name, node)
+            elif "Inport" in of or not of:  # or unknown: an input that the model does not use has no comment
+                found.inputs += self._spread(_identifier(port) or name, name, node)
             else:
-                raise self._no(f"does not say whether the root port {name} ({kind}) is an input; {_TAKE_DEFAULT}")
+                found.outputs += self._spread(_identifier(port) or name, name, node)
 
     def _ports(self, found: Model) -> None:
         """Root ports that functions are given one by one."""
         for name, parameter in self.ports.items():
             node = parameter.type.type if isinstance(parameter.type, c_ast.PtrDecl) else parameter.type
-            kind, width = self._number(node)
-            if not kind:
-                raise self._not_a_port(name, node)
             match = re.match(rf"(?:rt|{self.model}_)([UY])_", name) or re.match(r"(?:rt|\w+?_)([UY])_|arg_", name)
             port = name[match.end() :] if match else name
-            place = f"instance->arguments.{name}"
-            plain = node.type if isinstance(node, c_ast.ArrayDecl) else node
-            c_type = _type_name(plain)
-            found.arguments.append(f"{c_type} {name}{f'[{width}]' if node is not plain else ''};")
+            signals = self._spread(port, f"instance->arguments.{name}", node)
+            found.arguments.append(self._declared(name, node))
             if self._is_input(parameter, port, match[1] if match else None):
-                found.inputs.append(Signal(port, kind, width, place))
+                found.inputs += signals
             else:
-                found.outputs.append(Signal(port, kind, width, place))
+                found.outputs += signals
+
+    def _declared(self, name: str, node: Any) -> str:
+        """A member of that name and type."""
+        ends = ""
+        while isinstance(node, c_ast.ArrayDecl):
+            ends += f"[{int(_value(node.dim) or 0)}]"
+            node = node.type
+        return f"{self._written(_type_name(node))} {name}{ends};"
+
+    def _spread(self, name: str, place: str, node: Any, port: str = "") -> list[Signal]:
+        """A root port; of a bus, its numbers, one by one. UserError where some of it is no number."""
+        port = port or place
+        kind, width = self._number(node)
+        if kind:
+            return [Signal(name, kind, width, place, port=port)]
+        if isinstance(node, c_ast.ArrayDecl):
+            elements = range(int(_value(node.dim) or 0))
+            parts = [(f"{name}_{i + 1}", f"{place}[{i}]", node.type) for i in elements]
+        else:
+            structure = getattr(node, "type", None)
+            inner = structure.decls if isinstance(structure, c_ast.Struct) else None
+            fields = inner or self._fields(_type_name(node) or "")
+            parts = [(f"{name}_{each.name}", f"{place}.{each.name}", each.type) for each in fields]
+        if not parts:
+            raise self._not_a_port(name, node)
+        return [signal for part in parts for signal in self._spread(*part, port)]
 
     def _returned(self, found: Model, node: Any) -> str:
         """Where what a step function returns goes: to a port of its own."""
@@ -669,13 +791,11 @@ class _Reader:
         return [each.name for each in self._given(function)]
 
     def _signals(self, place: str, type_name: str) -> list[Signal]:
-        found = []
-        for part in self._fields(type_name):
-            kind, width = self._number(part.type)
-            if not kind:
-                raise self._not_a_port(part.name, part.type)
-            found.append(Signal(part.name, kind, width, f"{place}.{part.name}"))
-        return found
+        return [
+            signal
+            for part in self._fields(type_name)
+            for signal in self._spread(part.name, f"{place}.{part.name}", part.type)
+        ]
 
     def _parameters(self, found: Model, place: str) -> None:
         """Those that are numbers; others keep what was generated."""
@@ -717,13 +837,15 @@ class _Reader:
     def _number(self, node: Any) -> tuple[str, int]:
         """Type and width of a number or a vector; no type for anything else."""
         width = 1
-        if isinstance(node, c_ast.ArrayDecl):
-            width = int(_value(node.dim) or 0)
+        while isinstance(node, c_ast.ArrayDecl):
+            width *= int(_value(node.dim) or 0)
             node = node.type
         name = _type_name(node)
         for _ in self.types:  # a type may be another name of another name
             if name in _TYPES or name not in self.types:
                 break
+            if isinstance(getattr(self.types[name], "type", None), c_ast.Enum):
+                return "int32", width
             name = _type_name(self.types[name])
         return _TYPES.get(name or "", ""), width
 

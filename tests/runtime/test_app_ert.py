@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -83,12 +84,23 @@ RTM = "DW_sample_T *dwork;"
 REFUSED = {
     "exported functions": ("sample.h", "sample_step", "sample_tick", "has no function sample_step (it has: sample_in"),
     "a direction": ("sample.h", STEP1, f"{STEP1}real_T *arg_speed, ", "whether the argument arg_speed is an input"),
-    "a bus": ("sample.h", "real_T error; ", "struct { real_T a; } error; ", "has a root port error of type struct"),
+    "names twice": (
+        "sample.h",
+        "real_T error; ",
+        "real_T error; struct { real_T a; } error_b; real_T error_b_a; ",
+        "has 2 inputs named error_b_a",
+    ),
+    "text": (
+        "sample.h",
+        "real_T error; ",
+        "char *error; ",
+        "has a root port error of type char; root ports are numbers",
+    ),
     "a bus by pointer": (
         "sample.h",
         STEP1,
         f"{STEP1}struct bus *sample_U_bus, ",
-        "has a root port sample_U_bus of type bus; root",
+        "has a root port bus of type bus; root",
     ),
     "an allocation": (
         "sample.h",
@@ -263,4 +275,11 @@ def test_a_model_of_one_rate_is_held_to_the_period_that_its_main_program_says(
     with pytest.raises(AssertionError, match=r"generated for a period of 20\.0 ms, and runs each 10 ms"):
         run(flotilla_run, generated, TASK, 1, "plain.command")
     code = ert.collect(generated, "sample", out := tmp_path / "collected")
-    assert ert.read("sample", ert.preprocess(out, "sample", code, HOST), code, [0.01]).period_s == 0.01
+    read_by = ert.preprocess(out, "sample", code, HOST)
+    said = "sample_times: 0.01: is not what the code was generated for: its main program has 0.02; leave the key out"
+    with pytest.raises(UserError, match=said):
+        ert.read("sample", read_by, code, [0.01])
+    counted = replace(code, sources=f"{code.sources}\nsample_M->Timing.stepSize0 = 0.04;\n")
+    assert ert.read("sample", read_by, counted, []).period_s == 0.04
+    with pytest.raises(UserError, match=r"generated for: Timing\.stepSize0 has 0\.04; leave the key out"):
+        ert.read("sample", read_by, counted, [0.02])

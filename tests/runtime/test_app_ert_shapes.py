@@ -26,7 +26,8 @@ REFUSED = {
     "c++": "is C++, and the locked compiler for robots is one for C only; generate C",
     "solver": "generated/ lacks rtw_continuous.h: it is a header of MATLAB's own, which the model's options need; let",
     "cmsis": "generated/ lacks arm_math.h: it is CMSIS, the library of ARM processors, and robots have none; generate",
-    "bus": "generated/plant.h: has a root port plant_U_measurements of type measurement; root ports are numbers or",
+    "custom-code": "generated/ lacks pigpio.h: it is neither the coder's nor the C library's, but of code that",
+    "board": "generated/ lacks MW_gpio.h: it is of a hardware support package, and drives a board; generate for no",
 }
 ACCEPTED = {name: shape for name, shape in SHAPES.items() if name not in REFUSED}
 SILENT = {
@@ -37,7 +38,7 @@ SILENT = {
 USED = ACCEPTED | {f"silent-{name}": shape for name, shape in SILENT.items()}
 OWN = {"Kp": 1.5, "Limit": 2.0, "Weights": [0.5, 1.0]}
 GENERATED = {"Kp": 2.5, "Limit": 10.0, "Weights": [0.25, -0.25]}
-BLOCK = "{name}: {{type: model, in: {{error: ramp.out, rates: [1, 2], enable: 1}}{more}}}"
+BLOCK = "{name}: {{type: model, in: {{error: ramp.out, rates: [1, 2], enable: 1{inputs}}}{more}}}"
 TASK = (
     "period: 10 ms\npriority: 0\nblocks:\n  time: {{type: clock}}\n  ramp: {{type: gain, in: {{in: time.time}}}}\n{}\n"
 )
@@ -45,7 +46,7 @@ STEPS = 23
 
 
 def test_there_are_as_many_as_were_found_and_most_are_accepted() -> None:
-    assert (len(SHAPES), len(ACCEPTED)) == (39, 34)
+    assert (len(SHAPES), len(ACCEPTED)) == (45, 39)
 
 
 @pytest.fixture
@@ -87,8 +88,11 @@ def run(flotilla_run: Path, blocks: Path, task: str, watch: str, *options: str) 
     return subprocess.run([*argv, str(file)], capture_output=True, text=True, timeout=60, check=False)
 
 
-def written(name: str, parameters: dict[str, object] | None = None) -> str:
-    return "  " + BLOCK.format(name=name, more=f", parameters: {json.dumps(parameters)}" if parameters else "")
+def written(name: str, parameters: dict[str, object] | None = None, shape: Shape | None = None) -> str:
+    inputs = ", measurements_current: [0, 0, 0]" if shape and shape.bus else ""
+    inputs += ", spare: 0" if shape and shape.signal else ""
+    more = f", parameters: {json.dumps(parameters)}" if parameters else ""
+    return "  " + BLOCK.format(name=name, inputs=inputs, more=more)
 
 
 def response(errors: list[float], every: int, parameters: dict[str, object]) -> list[float]:
@@ -111,7 +115,7 @@ def test_a_shape_does_what_the_model_does(flotilla_run: Path, work: Path, shape:
     blocks = build(shape, work)
     generated = GENERATED | ({"Limit": math.inf} if shape.infinite else {})
     variants = {"plain": generated} | ({"tuned": OWN} if shape.tunable else {"other": generated})
-    texts = [written(name, OWN if name == "tuned" else None) for name in variants]
+    texts = [written(name, OWN if name == "tuned" else None, shape) for name in variants]
     command = "out" if shape.io == "custom" else "command"
     groups = [[0], [1]] if shape.once else [[0, 1]]
     for group in groups:
@@ -132,7 +136,7 @@ def test_a_shape_does_what_the_model_does(flotilla_run: Path, work: Path, shape:
         said = r"the model has global variables \(.+\), so a task can have it once, and block plain is it; generate"
         assert (done.returncode, bool(re.search(said, done.stderr))) == (2, True), done.stderr
     if not shape.tunable:
-        done = run(flotilla_run, blocks, TASK.format(written("plain", OWN)), "ramp.out", "--check")
+        done = run(flotilla_run, blocks, TASK.format(written("plain", OWN, shape)), "ramp.out", "--check")
         assert (done.returncode, "Kp" in done.stderr) == (2, True), done.stderr
 
 
@@ -143,7 +147,7 @@ TUNABLE = {name: shape for name, shape in USED.items() if shape.tunable}
 def test_a_shape_is_tuned_while_it_runs(flotilla_run: Path, work: Path, shape: Shape) -> None:
     blocks, control = build(shape, work), work / "control"
     argv: list[str | Path] = [flotilla_run, "--blocks", blocks, "--control", control, "--watch", "model.command"]
-    block = "  model: {type: model, in: {error: 0, rates: [1, 0], enable: 1}, parameters: {Weights: [-3, 0]}}"
+    block = written("model", {"Weights": [-3, 0]}, shape).replace("ramp.out", "0").replace("[1, 2]", "[1, 0]")
     with running(argv, work / "run.yml", TASK.format(block)) as task:
         task.until(lambda row: row["command"] == 3)
         param: list[str | Path] = [
@@ -176,6 +180,16 @@ def test_what_a_model_begins_with_is_shown_and_a_task_file_may_set_what_was_gene
         done = run(flotilla_run, blocks, TASK.format(text), "model.command")
         assert done.returncode == 0, done.stderr
         assert json.loads(done.stdout.splitlines()[0])["model.command"] == command
+
+
+def test_a_signal_that_its_user_exports_is_an_output(flotilla_run: Path, work: Path) -> None:
+    """Seen to fail as a root port that is neither input nor output."""
+    done = run(flotilla_run, build(SHAPES["signal"], work), TASK.format(written("model", None, SHAPES["signal"])),
+               "ramp.out,model.plant_Sum_1")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    sums = [0.5 * sum(row["ramp.out"] for row in rows[:step]) for step in range(STEPS)]
+    assert [row["model.plant_Sum_1"] for row in rows] == pytest.approx(sums)
 
 
 @pytest.mark.parametrize(("name", "said"), REFUSED.items(), ids=REFUSED.keys())
@@ -226,3 +240,50 @@ def test_word_sizes_are_the_robots(fleet: Fleet, tmp_path: Path, word_size: str,
     ((other, board),) = boards.items()
     with pytest.raises(UserError, match=f"was generated for another size of ulong/long than {other} has; choose the"):
         builder.build(app.load(directory), board, tmp_path / "refused")
+
+
+MIXER = {
+    "rtwtypes.h": "typedef double real_T;\ntypedef float real32_T;\ntypedef unsigned char boolean_T;\n",
+    "mixer.h": """\
+#include "rtwtypes.h"
+typedef enum { Off = 0, On } mode;
+typedef struct { real_T speed; boolean_T on; } wheel;
+typedef struct { wheel left; wheel right; real32_T yaw[2]; } command;
+typedef struct { command wanted; real_T gain; mode state; } ExtU_mixer_T;
+typedef struct { wheel made[2]; real_T grid[2][2]; mode state; } ExtY_mixer_T;
+extern ExtU_mixer_T mixer_U;
+extern ExtY_mixer_T mixer_Y;
+extern void mixer_initialize(void);
+extern void mixer_step(void);
+""",
+    "mixer.c": """\
+#include "mixer.h"
+ExtU_mixer_T mixer_U;
+ExtY_mixer_T mixer_Y;
+void mixer_initialize(void) {}
+void mixer_step(void)
+{
+  mixer_Y.made[0].speed = mixer_U.gain * mixer_U.wanted.left.speed;
+  mixer_Y.made[1].speed = mixer_U.gain * mixer_U.wanted.right.speed;
+  mixer_Y.made[1].on = mixer_U.wanted.right.on;
+  mixer_Y.grid[1][0] = mixer_U.wanted.yaw[1];
+  mixer_Y.state = mixer_U.state;
+}
+""",
+}
+
+
+def test_a_bus_is_a_port_for_each_of_its_numbers(flotilla_run: Path, work: Path) -> None:
+    """Nested, in an array, and with an enumeration. Seen to fail as a root port of a type that is no number."""
+    generated = work / "app" / ert.GENERATED
+    generated.mkdir(parents=True)
+    for name, text in MIXER.items():
+        (generated / name).write_text(text)
+    blocks = compiled(Shape("mixer", model="mixer"), work)
+    inputs = "wanted_left_speed: 2, wanted_left_on: 0, wanted_right_speed: -3, wanted_right_on: 1, wanted_yaw: [5, 7]"
+    block = f"  model: {{type: model, in: {{{inputs}, gain: 10, state: 1}}}}"
+    outputs = ["made_1_speed", "made_1_on", "made_2_speed", "made_2_on", "grid", "state"]
+    done = run(flotilla_run, blocks, TASK.format(block), ",".join(f"model.{name}" for name in outputs))
+    assert done.returncode == 0, done.stderr
+    row = json.loads(done.stdout.splitlines()[0])
+    assert [row[f"model.{name}"] for name in outputs] == [20, 0, -30, 1, [0, 0, 7, 0], 1]
