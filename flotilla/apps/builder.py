@@ -44,9 +44,10 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
                     source = Path(work) / "source"
                     model, times_s = description.model, description.sample_times
                     tasking = description.tasking
-                    ert.block(subject.directory, model, subject.name, times_s, source, board.system, tasking)
+                    name = subject.name
+                    defines = ert.block(subject.directory, model, name, times_s, source, board.system, tasking)
                     try:
-                        _blocks(subject, source, ("-Wall",), board.system, out, run)
+                        _blocks(subject, source, ("-Wall", *defines), board.system, out, run)
                     except UserError as error:
                         raise ert.explained(error, board.system) from None
             elif isinstance(description, app.Fmu):

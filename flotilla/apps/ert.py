@@ -200,6 +200,8 @@ class Code:
     """All that is compiled."""
     main: str = ""
     """The example of a program around the model; none if it was not kept."""
+    defines: tuple[str, ...] = ()
+    """Macros that it was generated for, such as `MAT_FILE=0`."""
 
 
 @dataclass
@@ -229,6 +231,8 @@ class Model:
     terminate: str | None = None
     error_status: str = ""
     """Where the model says that it failed, as C."""
+    stop: str = ""
+    """Where a Stop Simulation block of the model asks for its end, as C."""
     period_s: float | None = None
     """Of the fastest rate, where the code says so."""
     shared: str = ""
@@ -249,6 +253,10 @@ class Model:
         return sorted((step for step in self.steps if step not in self.own), key=lambda step: step.every)
 
 
+DEFINES = "defines.txt"
+"""Where packNGo leaves the macros that the coder's own build would define, one a line."""
+
+
 def block(
     directory: Path,
     model: str,
@@ -257,8 +265,8 @@ def block(
     out: Path,
     system: System,
     tasking: str | None = None,
-) -> None:
-    """Fill `out` with the C files of a plug-in for `system`, whose block is `name`.
+) -> list[str]:
+    """Fill `out` with the C files of a plug-in for `system`, whose block is `name`; the compiler's options for them.
 
     `tasking`: the key of app.yml.
     """
@@ -268,6 +276,7 @@ def block(
     if tasking != "single":
         separate(found, code, wanted=tasking == "threads")
     (out / "flotilla_block.c").write_text(render(found, name))
+    return [f"-D{each}" for each in code.defines]
 
 
 def collect(generated: Path, model: str, out: Path) -> Code:
@@ -292,7 +301,23 @@ def collect(generated: Path, model: str, out: Path) -> Code:
     mains = [file for pattern in _MAINS for file in sorted(generated.rglob(pattern))]
     sources = "".join(file.read_text(errors="replace") for file in sorted(out.glob("*.c")))
     header = (out / f"{model}.h").read_text(errors="replace")
-    return Code(header, sources, "".join(file.read_text(errors="replace") for file in mains))
+    main = "".join(file.read_text(errors="replace") for file in mains)
+    return Code(header, sources, main, _defined(sorted(generated.rglob(DEFINES))))
+
+
+def _defined(files: list[Path]) -> tuple[str, ...]:
+    """The macros of such files."""
+    found: dict[str, str] = {}
+    for file in files:
+        for number, line in enumerate(file.read_text(errors="replace").splitlines(), 1):
+            macro = line.strip().removeprefix("-D")
+            if macro and not re.fullmatch(r"[A-Za-z_]\w*(\(\w*\))?(=.*)?", macro):
+                remedy = "a line is NAME or NAME=VALUE, as packNGo writes it"
+                raise UserError(f"{GENERATED}/{file.name}: line {number}: {macro}: is no macro; {remedy}")
+            name = macro.partition("=")[0]
+            if found.setdefault(name, macro) != macro:
+                raise UserError(f"{GENERATED}/{DEFINES}: {found[name]} and {macro}; leave the model's own file alone")
+    return tuple(macro for name, macro in found.items() if name)
 
 
 def preprocess(generated: Path, model: str, code: Code, system: System) -> str:
@@ -309,7 +334,7 @@ def preprocess(generated: Path, model: str, code: Code, system: System) -> str:
             (work / "library" / name).write_text(_HEADERS.get(name, ""))
         (work / "source" / "flotilla_model.c").write_text(f'#include "{model}.h"\n')
         argv = ["env", "-C", "/out/source", "gcc", "-E", "-P", "-nostdinc", "-I/out/library", "-I."]
-        argv += [*(f"-D{each}" for each in _WITHOUT), "-o", "/out/model.i", "flotilla_model.c"]
+        argv += [*(f"-D{each}" for each in (*_WITHOUT, *code.defines)), "-o", "/out/model.i", "flotilla_model.c"]
         try:
             runtime.command(work, system, argv)
         except UserError as error:
@@ -530,8 +555,11 @@ class _Reader:
             self._parameters(found, places["parameters"])
         self._exported(found)
         self._ports(found)
-        if "model" in places and any(path == "errorStatus" for path, _ in self._leaves(self.kinds["model"])):
-            found.error_status = f"{places['model']}.errorStatus"
+        if "model" in places:
+            if any(path == "errorStatus" for path, _ in self._leaves(self.kinds["model"])):
+                found.error_status = f"{places['model']}.errorStatus"
+            if any(path == "Timing.stopRequestedFlag" for path, _ in self._leaves(self.kinds["model"])):
+                found.stop = f"{places['model']}.Timing.stopRequestedFlag"
         found.initialize = self._call(found.begin, 0)
         found.terminate = self._call(found.end, 0) if found.end in self.functions else None
         for name, number, every in functions:

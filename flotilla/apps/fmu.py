@@ -22,7 +22,7 @@ from xml.etree import ElementTree
 import jinja2
 
 from flotilla.apps import app
-from flotilla.common import paths
+from flotilla.common import paths, progress
 from flotilla.common.errors import Problem, UserError
 from flotilla.common.sources import ignored
 from flotilla.fleet.model import System
@@ -44,6 +44,8 @@ _PLATFORMS = {
 """Folder of binaries, by FMI's version and Debian's name of the architecture."""
 _FAILURES = ("logStatusDiscard", "logStatusError", "logStatusFatal")
 """FMI's categories of messages about steps that fail."""
+_LACKING = re.compile(r"undefined reference to `([^']+)'|(\S+\.so\S*), needed by \S+, not found|(version `?\S+)")
+"""What a linker writes of symbols and libraries that are nowhere."""
 _MACHINES = {"i386": (1, 3), "amd64": (2, 62)}
 """ELF's class and machine."""
 _SIGNALS = {
@@ -441,14 +443,19 @@ def render(unit: Unit, name: str) -> str:
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["quoted"] = _quoted
+    functions, asked = _functions(unit)
+    file = "/".join(Path(unit.file).parts[-2:])  # within the app: where that lies makes no difference to the code
+    template = environment.from_string(TEMPLATE.read_text())
+    return template.render(unit=unit, name=name, groups=_groups, functions=functions, asked=asked, file=file)
+
+
+def _functions(unit: Unit) -> tuple[list[str], list[str]]:
+    """Those that the block calls, without their prefixes, and those that it calls where there are any."""
     begin = {"2": ["Instantiate", "SetupExperiment"], "3": ["InstantiateCoSimulation"]}[unit.version]
     functions = [*begin, "SetDebugLogging", "EnterInitializationMode", "ExitInitializationMode", "DoStep", "Terminate"]
     functions += ["FreeInstance", *(f"Get{accessor}" for accessor in _groups(unit.outputs))]
     functions += [f"Set{accessor}" for accessor in _groups([*unit.inputs, *unit.parameters])]
-    asked = {"2": ["GetBooleanStatus", "GetRealStatus"], "3": []}[unit.version]
-    file = "/".join(Path(unit.file).parts[-2:])  # within the app: where that lies makes no difference to the code
-    template = environment.from_string(TEMPLATE.read_text())
-    return template.render(unit=unit, name=name, groups=_groups, functions=functions, asked=asked, file=file)
+    return functions, {"2": ["GetBooleanStatus", "GetRealStatus"], "3": []}[unit.version]
 
 
 def build(unit: Unit, name: str, system: System, out: Path, run: toolchain.Run = toolchain.run) -> None:
@@ -458,29 +465,54 @@ def build(unit: Unit, name: str, system: System, out: Path, run: toolchain.Run =
     """
     final = out / object_of(name)
     final.parent.mkdir(parents=True)
-    if found := _sources_unless_binary(unit, system):
-        final.write_bytes(_compiled(unit, found, system, run))
+    try:
+        found = sources(unit, system)
+        made = _compiled(unit, found, system, run) if found else None
+    except UserError as error:
+        try:
+            binary(unit, system)
+        except UserError:
+            raise error from None  # what is wrong with its sources says more
+        progress.say(f"{unit.file}: takes the unit's binary, because of its sources: {str(error).splitlines()[0]}")
+        made = None
+    if made:
+        final.write_bytes(made)
         final.chmod(0o755)  # as linkers leave it
     else:
         place = binary(unit, system)
         shutil.copytree(place, final.parent, ignore=ignored, dirs_exist_ok=True)
         (final.parent / f"{unit.identifier}.so").rename(final)
+    _check(unit, final.parent, system, run)
     if unit.resources:
         shutil.copytree(unit.directory / "resources", final.parent.parent / "resources", ignore=ignored)
 
 
-def _sources_unless_binary(unit: Unit, system: System) -> Sources | None:
-    """What to compile; None where it lacks sources, or some of them cannot be, and brings a binary."""
-    try:
-        return sources(unit, system)
-    except UserError:
+def _check(unit: Unit, place: Path, system: System, run: toolchain.Run) -> None:
+    """Refuse a unit that robots could not load, or without functions that its block calls: here, not there.
+
+    A program that is linked with it needs what it needs: the linker looks for that among the robot's libraries.
+    """
+    functions, _ = _functions(unit)
+    with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as directory:
+        work = Path(directory)
+        shutil.copytree(place, work / "unit")
+        (work / "probe.c").write_text("int main(void) { return 0; }\n")
+        link = ["gcc", "-o", "/out/probe", "/out/probe.c", "-Wl,--no-as-needed,--no-allow-shlib-undefined"]
+        link += ["-Wl,--fatal-warnings,-rpath-link,/out/unit", "/out/unit/unit.so", "-lm", "-ldl", "-lpthread"]
         try:
-            binary(unit, system)
-        except UserError:
-            pass  # what is wrong with its sources says more
-        else:
-            return None
-        raise
+            runtime.command(work, system, link, run)
+        except UserError as error:
+            lacking = sorted(set(_LACKING.findall(str(error))))
+            what = ", ".join(" ".join(filter(None, each)) for each in lacking) or str(error)
+            raise UserError(
+                f"{unit.file}: its code needs what robots lack: {what}; export the unit with all that it needs"
+            ) from None
+        runtime.command(work, system, ["sh", "-c", "nm -D --defined-only /out/unit/unit.so >/out/symbols"], run)
+        defined = {line.split()[-1].partition("@")[0] for line in (work / "symbols").read_text().splitlines()}
+    prefix = unit.identifier.replace("-", "_")
+    names = [f"fmi{unit.version}{function}" for function in functions]
+    if missing := [name for name in names if not {name, f"{prefix}_{name}"} & defined]:
+        raise UserError(f"{unit.file}: its code has no function {', '.join(missing)}; export the unit anew")
 
 
 def _compiled(unit: Unit, found: Sources, system: System, run: toolchain.Run) -> bytes:
@@ -489,7 +521,9 @@ def _compiled(unit: Unit, found: Sources, system: System, run: toolchain.Run) ->
         tree = Path(directory) / "source"
         shutil.copytree(unit.directory / "sources", tree / "sources", ignore=ignored)
         shutil.copytree(HEADERS, tree / "fmi", ignore=ignored)
-        options = ["-std=gnu17", "-Wall", "-Wl,-Bsymbolic,-z,defs", "-Isources", "-Ifmi", *found.options]
+        # Sources of one tool for both versions ask which one it is; FMI 3.0's build description may say so, too.
+        options = ["-std=gnu17", "-Wall", "-Wl,-Bsymbolic,-z,defs", f"-DFMI_VERSION={unit.version}"]
+        options += ["-Isources", "-Ifmi", *found.options]
         files = [f"sources/{name}" for name in found.files]
         return runtime.compile_shared(tree, files, system, options, run)
 

@@ -100,9 +100,9 @@ def _unpack(archive: Path, out: Path) -> None:
                     raise UserError(
                         f"{archive}: {name}: is no file inside the archive; pack it with packNGo(buildInfo)"
                     )
-                if path.suffix.lower() not in _KEPT:
+                if path.suffix.lower() not in _KEPT and path.name != ert.DEFINES:
                     continue
-                files += 1
+                files += path.name != ert.DEFINES
                 place = out / path
                 if place.exists():
                     raise UserError(f"{archive}: {name}: is in it twice; pack it with packNGo(buildInfo)")

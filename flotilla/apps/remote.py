@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from flotilla.apps import app, fmu
-from flotilla.common import durable, paths, progress
+from flotilla.common import durable, namespace, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.common.processes import DIE_WITH_PARENT
 from flotilla.fleet import apps
@@ -67,7 +67,7 @@ class Connection:
     def stream(self, command: str, name: str, *arguments: str, stdin: Path, stdout: Path, log: Path) -> None:
         """Run it between two files; what it says besides is shown as it comes, and kept in `log`."""
         argv = [*DIE_WITH_PARENT, *self.argv(command, name, *arguments)]
-        last = ""
+        last = failed = ""
         with stdin.open("rb") as given, stdout.open("wb") as made, log.open("w") as kept:
             pipe = subprocess.PIPE
             with subprocess.Popen(argv, stdin=given, stdout=made, stderr=pipe, text=True, errors="replace") as process:
@@ -76,11 +76,14 @@ class Connection:
                     for last in process.stderr:
                         kept.write(last)
                         print(last, end="", file=sys.stderr, flush=True)
+                        failed = failed or (last if namespace.ERROR.search(last) else "")
                     process.wait()
                 finally:
                     process.terminate()
         if process.returncode:
-            raise self.error(process.returncode, f"{last.strip()}; what it said is above and in {paths.shown(log)}")
+            raise self.error(
+                process.returncode, f"{(failed or last).strip()}; what it said is above and in {paths.shown(log)}"
+            )
 
     def error(self, status: int, message: str) -> UserError:
         """Why something failed on the robot, or on the way."""

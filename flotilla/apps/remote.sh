@@ -77,8 +77,8 @@ receive() {
             refuse "its runtime refuses the app; nothing was changed"
     done
     if [ "$program" ]; then
-        ! ldd "$part/$program" | grep "not found" >&2 ||
-            refuse "$program needs libraries that the robot lacks; nothing was changed"
+        ! ldd -r "$part/$program" 2>&1 | grep -e "not found" -e "undefined symbol" >&2 ||
+            refuse "$program needs libraries or functions that the robot lacks; nothing was changed"
     fi
     sync -f "$part"
 

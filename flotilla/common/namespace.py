@@ -32,6 +32,12 @@ _CAPABILITIES = {
 """What a stage needs of root: the numbers (linux/capability.h), and what a build does with each."""
 
 
+ERROR = re.compile(r"(^|[\s:])(fatal )?error:|undefined reference to|\*\*\* \[")
+"""What compilers, linkers and make write in a line that says why they failed."""
+_TAIL = 30
+"""Lines of a log that an error shows."""
+
+
 def missing_capabilities(status: str) -> list[str]:
     """Those that a process has not, by its /proc/PID/status."""
     effective = int(re.findall(r"^CapEff:\s*([0-9a-f]+)$", status, re.MULTILINE)[0], 16)
@@ -150,5 +156,12 @@ def run_logged(title: str, argv: Sequence[str], log: Path, environment: Mapping[
         finally:
             process.kill()
     if status != 0:
-        tail = "\n".join(log.read_text(errors="replace").splitlines()[-30:])
-        raise UserError(f"{title} failed (status {status}); the end of {paths.shown(log)}:\n{tail}")
+        said = telling(log.read_text(errors="replace"))
+        raise UserError(f"{title} failed (status {status}); the end of {paths.shown(log)}:\n{said}")
+
+
+def telling(text: str) -> str:
+    """The end of a log, and before it the errors that came earlier: a compiler's warnings may come after them."""
+    lines = text.splitlines()
+    early = [line for line in lines[:-_TAIL] if ERROR.search(line)][:10]
+    return "\n".join([*early, *(["…"] if early else []), *lines[-_TAIL:]])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -71,7 +72,9 @@ def compile_plugin(
     """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture."""
     found = sources.files(source) if source.is_dir() else [source]
     files = [path.name for path in found if path == source or (path.parent == source and path.suffix == ".c")]
-    options = ["-std=c11", *options, "-fvisibility=hidden", "-I/out/include"]
+    # Its functions keep their names, for the report of a crash, and are nobody else's.
+    bound = ["-Wl,-Bsymbolic", "-fno-semantic-interposition"]
+    options = ["-std=c11", *options, *bound, "-I/out/include"]
     return compile_shared(source, files, system, options, run)
 
 
@@ -101,7 +104,7 @@ def check_plugins(directory: Path, system: System) -> None:
     """
     done = _run(system, "flotilla-blocks", "--blocks", str(directory))
     if done.returncode:
-        raise UserError(done.stderr.replace(f"{directory}/", "").strip())
+        raise UserError(_said(done).replace(f"{directory}/", ""))
 
 
 def check_task(path: Path, content: bytes, plugins: Path | None = None, system: System = HOST) -> None:
@@ -115,7 +118,15 @@ def check_task(path: Path, content: bytes, plugins: Path | None = None, system: 
         directories = ":".join(str(each) for each in (plugins, _programs(system) / "usr/lib/flotilla/blocks") if each)
         done = _run(system, "flotilla-run", "--check", "--blocks", directories, str(file))
         if done.returncode:
-            raise UserError(done.stderr.replace(str(file), paths.shown(path)).strip())
+            raise UserError(_said(done).replace(str(file), paths.shown(path)))
+
+
+def _said(done: subprocess.CompletedProcess[str]) -> str:
+    """Why it failed. Of a crash it does not say so itself."""
+    if done.returncode >= 0:
+        return done.stderr.strip()
+    crashed = f"{Path(done.args[0]).name} was ended by {signal.Signals(-done.returncode).name}"
+    return f"{crashed}: code of a block crashes when it is loaded or configured\n{done.stderr}".strip()
 
 
 def _programs(system: System) -> Path:

@@ -69,6 +69,7 @@ static bool start_blocks(struct task *task, struct run_result *result)
             end(result, ENDING_FAILED, task_block->block, task_block->block->service->failure);
             return false;
         }
+        safety_running = task_block->block;
         task_block->started = true; /* terminate also cleans up after a start that failed halfway */
         if (task_block->block->type->start && task_block->block->type->start(task_block->block) != FL_OK) {
             end(result, ENDING_FAILED, task_block->block, task_block->block->service->failure);
@@ -77,11 +78,13 @@ static bool start_blocks(struct task *task, struct run_result *result)
     }
     for (size_t i = 0; i < task->count; i++) {
         struct fl_block *block = task->blocks[i].block;
+        safety_running = block;
         if (block->type->initialize && block->type->initialize(block) != FL_OK) {
             end(result, ENDING_FAILED, block, block->service->failure);
             return false;
         }
     }
+    safety_running = NULL;
     return true;
 }
 
@@ -96,6 +99,7 @@ static void terminate_blocks(struct task *task)
 {
     for (size_t i = task->count; i-- > 0;) {
         struct task_block *task_block = &task->blocks[i];
+        safety_running = task_block->block;
         if (task_block->started && task_block->block->type->terminate)
             task_block->block->type->terminate(task_block->block);
         task_block->started = false;

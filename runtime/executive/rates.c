@@ -51,6 +51,7 @@ static void wait_for(sem_t *semaphore)
 static void *serve(void *argument)
 {
     struct rate *rate = argument;
+    safety_running = rate->block;
     privilege_touch_stack();
     for (;;) {
         wait_for(&rate->released);

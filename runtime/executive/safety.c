@@ -1,13 +1,17 @@
 #define _GNU_SOURCE
 #include "safety.h"
 
+#include <dlfcn.h>
 #include <errno.h>
+#include <inttypes.h>
 #include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/prctl.h>
 #include <sys/types.h>
 #include <time.h>
+#include <ucontext.h>
 #include <unistd.h>
 
 enum {
@@ -21,6 +25,14 @@ enum {
 
 static const int fatal_signals[] = {SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGABRT, SIGSYS, SIGTRAP};
 #define FATAL_SIGNALS (sizeof fatal_signals / sizeof *fatal_signals)
+
+#if defined(__x86_64__)
+#define PROGRAM_COUNTER REG_RIP
+#else
+#define PROGRAM_COUNTER REG_EIP
+#endif
+
+_Thread_local const struct fl_block *safety_running;
 
 /* One for the process, as signals are. */
 static struct {
@@ -58,14 +70,40 @@ static void stop_outputs(void)
     park_stepping(self);
     while (atomic_load(&safety.left)) {
         const struct task_block *task_block = &task->blocks[atomic_fetch_sub(&safety.left, 1) - 1];
+        safety_running = task_block->block;
         if (task_block->started && task_block->block->type->safe)
             task_block->block->type->safe(task_block->block);
     }
 }
 
+/* Write what crashed: the first time, because what follows may be a crash of this. dladdr and snprintf are not in
+ * signal-safety(7): where they wait for a lock of the crashed code, the time limit ends the process. */
+static void report_crash(int number, const siginfo_t *info, const struct fl_block *running, uintptr_t at)
+{
+    static atomic_flag reported = ATOMIC_FLAG_INIT;
+    char text[512], thread[17] = "";
+    Dl_info place = {0};
+    const bool sent = info->si_code <= 0 && !(info->si_code == SI_TKILL && info->si_pid == getpid());
+    if (sent || atomic_flag_test_and_set(&reported))
+        return;
+    prctl(PR_GET_NAME, thread);
+    dladdr((void *)at, &place); /* NOLINT(performance-no-int-to-ptr): the kernel has it as a number */
+    const char *name = sigabbrev_np(number), *file = place.dli_fname ? strrchr(place.dli_fname, '/') : NULL;
+    int used =
+        snprintf(text, sizeof text, "flotilla: %s %s: SIG%s at address 0x%" PRIxPTR ", in %s+0x%" PRIxPTR,
+                 running ? "block" : "thread", running ? running->name : thread, name ? name : "?",
+                 (uintptr_t)info->si_addr, file ? file + 1 : "code that no file has", at - (uintptr_t)place.dli_fbase);
+    if (place.dli_sname && used > 0 && (size_t)used < sizeof text)
+        used += snprintf(text + used, sizeof text - (size_t)used, " (%s)", place.dli_sname);
+    size_t length = used > 0 && (size_t)used < sizeof text - 1 ? (size_t)used : sizeof text - 2;
+    text[length] = '\n';
+    if (write(STDERR_FILENO, text, length + 1) < 0)
+        return; /* stderr is gone */
+}
+
 static void handle(int number, siginfo_t *info, void *context)
 {
-    (void)context;
+    const struct fl_block *running = safety_running;
     if (number == OWN_SIGNAL && info->si_code == SI_TIMER)
         _exit(1);
     if (number == OWN_SIGNAL && info->si_code == SI_TKILL && gettid() == atomic_load(&safety.stepping)) {
@@ -74,6 +112,7 @@ static void handle(int number, siginfo_t *info, void *context)
             pause();
     }
     stop_outputs();
+    report_crash(number, info, running, (uintptr_t)((ucontext_t *)context)->uc_mcontext.gregs[PROGRAM_COUNTER]);
     /* The status, and the core if there is one, say what it died of. */
     signal(number, SIG_DFL);
     raise(number);

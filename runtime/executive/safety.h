@@ -5,6 +5,8 @@
  * actuator after `safe`. Then `safe` of each block is called, and the process ends. It ends in any case one second
  * after this began.
  *
+ * Of a crash, stderr gets the block, the signal and the place in the code, once outputs are safe.
+ *
  * A process is not notified of SIGKILL, of _exit(), or of being killed for want of memory. Then outputs keep their
  * state until the actuator's own time-out, or until the service manager runs `flotilla-run --safe`.
  *
@@ -21,6 +23,9 @@
  * the process: nothing runs yet. */
 void safety_begin(struct task *task);
 void safety_end(void);
+
+/* The block whose code the calling thread runs, for the report of a crash. */
+extern _Thread_local const struct fl_block *safety_running;
 
 /* The calling thread begins to step, or stops, so that it need not be parked. */
 void safety_step_begin(void);

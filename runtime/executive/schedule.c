@@ -1,6 +1,7 @@
 #include "schedule.h"
 
 #include "block.h"
+#include "safety.h"
 #include "ticks.h"
 
 #include <math.h>
@@ -83,6 +84,7 @@ const struct fl_block *schedule_step(struct schedule *schedule, int64_t release_
             struct fl_block *block = call->block;
             block_prefetch(call[AHEAD].block);
             block_release(block, release_ns);
+            safety_running = block;
             int failed = call->step(block);
             block->step++;
             int64_t after = ticks_now(counter), took = after - before;

@@ -181,7 +181,13 @@ def test_files_that_are_missing(generated: Path, tmp_path: Path) -> None:
 
 
 def run(
-    flotilla_run: Path, generated: Path, task: str, steps: int, watch: str, tasking: str | None = None
+    flotilla_run: Path,
+    generated: Path,
+    task: str,
+    steps: int,
+    watch: str,
+    tasking: str | None = None,
+    err: list[str] | None = None,
 ) -> list[dict[str, float]]:
     """The values of signals in each step of a task that uses the block `sample`."""
     out = generated.parent / "source"
@@ -196,6 +202,8 @@ def run(
     argv = [str(flotilla_run), "--blocks", str(generated.parent / "blocks"), "--steps", str(steps), "--no-wait"]
     done = subprocess.run([*argv, "--watch", watch, str(file)], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
+    if err is not None:
+        err.append(done.stderr)
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
@@ -254,6 +262,56 @@ def test_a_task_that_does_not_fit_the_model_is_refused(
 ) -> None:
     with pytest.raises(AssertionError, match=said):
         run(flotilla_run, generated, TASK.replace(old, new), 1, "plain.command")
+
+
+def test_a_model_may_ask_for_its_end(flotilla_run: Path, generated: Path) -> None:
+    """By a block Stop Simulation, or by the stop time of code of grt.tlc. Seen to fail: the former ran on, the latter
+    ended as failed."""
+    change(generated / "sample.h", "    } Timing;", "        boolean_T stopRequestedFlag;\n    } Timing;")
+    source = generated / "sample.c"
+    begin = re.search(r"void sample_step0\([^)]*\)[^{]*\{", source.read_text())
+    assert begin
+    code = source.read_text()
+    source.write_text(code.replace(begin[0], f"static int steps;\n{begin[0]}\n  if (++steps == 6) STOP;\n", 1))
+    stopping = source.read_text()
+    for how, said in (
+        ("sample_M->Timing.stopRequestedFlag = 1", "the model has come to its end, as it asks to (Stop Simulation)"),
+        ('sample_M->errorStatus = "Simulation finished"', "the model has come to the stop time that it was generated"),
+    ):
+        source.write_text(stopping.replace("STOP", how))
+        for left in ("source", "blocks"):
+            shutil.rmtree(generated.parent / left, ignore_errors=True)
+        out: list[str] = []
+        rows = run(flotilla_run, generated, SINGLE, 23, "plain.updates", err=out)
+        assert (len(rows), said in out[0]) == (5, True), out
+
+
+SINGLE = """\
+period: 10 ms
+priority: 0
+blocks:
+  plain: {type: sample, in: {error: 1, rates: [1, 2], enable: 1}}
+"""
+
+
+def test_macros_of_the_coders_build_are_defined(generated: Path) -> None:
+    """In defines.txt, as packNGo leaves them. Seen to fail with 3 where the code has 30."""
+    (generated / "defines.txt").write_text("MODEL=sample\nGAIN=10\n-DRT\n")
+    header = generated / "sample.h"
+    change(
+        header,
+        "typedef struct {",
+        "#if GAIN == 10 && defined(RT)\n#define WIDE 30\n#else\n#define WIDE 3\n#endif\ntypedef struct {",
+    )
+    change(header, "real_T error;", "real_T error[WIDE];")
+    assert read(generated).inputs[0].width == 30
+    options = ert.block(generated.parent, "sample", "sample", [], generated.parent / "source", HOST)
+    assert options == ["-DMODEL=sample", "-DGAIN=10", "-DRT"]
+    for text, said in (("a b\n", "line 1: a b: is no macro; a line is NAME or"), ("X=1\nX=2\n", "X=1 and X=2; leave")):
+        (generated / "defines.txt").write_text(text)
+        shutil.rmtree(generated.parent / "read")
+        with pytest.raises(UserError, match=said):
+            read(generated)
 
 
 MAIN = """\

@@ -38,8 +38,12 @@ def apps(flotilla_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
     def command(work: Path, system: object, argv: Sequence[str], *_run: object) -> None:
         assert system == HOST
-        shutil.copytree(runtime.SOURCE / "include", work / "include")
-        subprocess.run([word.replace("/out", str(work)) for word in argv], check=True)
+        runtime.copy_sources(work, "include")
+        done = subprocess.run(
+            [word.replace("/out", str(work)) for word in argv], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            raise UserError(done.stderr)
 
     monkeypatch.setattr(runtime, "command", command)
     monkeypatch.setattr(paths, "BUILD", tmp_path)
@@ -381,10 +385,81 @@ def test_code_of_another_export_is_said(flotilla_run: Path, apps: dict[str, Path
         run(flotilla_run, build(apps[version]), {"2": LAG_TASK, "3": TWO_LAGS_TASK}[version])
 
 
-def test_a_function_that_the_code_lacks(flotilla_run: Path, apps: dict[str, Path]) -> None:
+def test_a_function_that_the_code_lacks(apps: dict[str, Path]) -> None:
+    """Seen to fail: it was missed on the robot, when the task started."""
     change(apps["3"] / "unit" / "sources" / "two_lags.c", "fmi3Terminate", "elsewhere")
-    with pytest.raises(AssertionError, match="the unit lacks fmi3Terminate; export it anew"):
-        run(flotilla_run, build(apps["3"]), TWO_LAGS_TASK)
+    with pytest.raises(UserError, match=r"modelDescription\.xml: its code has no function fmi3Terminate; export the"):
+        build(apps["3"])
+
+
+def shared(out: Path, code: str, *options: str) -> None:
+    """A library of that code."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    source = out.with_suffix(".c")
+    source.write_text(code)
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", out, source, *options], check=True)
+
+
+def test_a_binary_that_robots_cannot_load_is_not_built(apps: dict[str, Path]) -> None:
+    """Seen to fail: both were found on the robot, the symbol after the app that was there had been replaced."""
+    make_binary(apps["2"], "2")
+    kept, unit = apps["2"].parent / "kept", apps["2"] / "unit"
+    with zipfile.ZipFile(apps["2"] / "exported.fmu") as archive:
+        archive.extractall(unit)
+    (apps["2"] / "exported.fmu").unlink()
+    place = unit / BINARIES["2"].format("lag")
+    place.rename(kept)
+    wanting = "double lookup(double); double table(double x) { return lookup(x); }"
+    shared(place, wanting, f"-Wl,--no-as-needed,{kept}")
+    with pytest.raises(UserError, match=r"its code needs what robots lack: .*lookup.*; export the unit with all"):
+        build(apps["2"])
+    shutil.rmtree(apps["2"].parent / "built")
+    shared(place.with_name("libtable.so"), "double lookup(double x) { return x; }", "-Wl,-soname,libtable.so")
+    shared(place, wanting, f"-L{place.parent}", "-ltable")
+    place.with_name("libtable.so").unlink()
+    with pytest.raises(UserError, match=r"needs what robots lack: libtable\.so"):
+        build(apps["2"])
+
+
+def test_a_binary_is_taken_where_sources_do_not_compile(
+    flotilla_run: Path, apps: dict[str, Path], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As those that need a library of the exporting tool. Seen to fail with the compiler's error."""
+    unit, made = apps["2"] / "unit", apps["2"].parent / "made"
+    fmu.build(read(apps["2"]), "made", HOST, made)
+    place = unit / BINARIES["2"].format("lag")
+    place.parent.mkdir(parents=True)
+    shutil.copyfile(made / fmu.object_of("made"), place)
+    source = unit / "sources" / "lag.c"
+    source.write_text('#include "tool.h"\n' + source.read_text())
+    rows = run(flotilla_run, build(apps["2"]), LAG_TASK, watch="plain.y")
+    assert [row["plain.y"] for row in rows] == pytest.approx(lag(2, 0.5, 30), rel=1e-9)
+    said = capfd.readouterr().err
+    assert "unit/modelDescription.xml: takes the unit's binary, because of its sources: " in said
+    assert "tool.h: No such file" in said
+    shutil.rmtree(unit / "binaries")
+    shutil.rmtree(apps["2"].parent / "built")
+    with pytest.raises(UserError, match=r"tool\.h: No such file"):
+        build(apps["2"])
+
+
+@pytest.mark.parametrize(("version", "file"), [("2", "lag.c"), ("3", "two_lags.c")])
+def test_sources_may_ask_for_their_version(apps: dict[str, Path], version: str, file: str) -> None:
+    """As those of the Reference FMUs, of which one file is for all versions. Seen to fail for FMI 2.0."""
+    source = apps[version] / "unit" / "sources" / file
+    source.write_text(f"#if FMI_VERSION != {version}\n#error of which version?\n#endif\n{source.read_text()}")
+    build(apps[version])
+
+
+def test_a_crash_names_block_and_place(flotilla_run: Path, apps: dict[str, Path]) -> None:
+    """Seen to fail: status -11, and not a word."""
+    source = apps["2"] / "unit" / "sources" / "lag.c"
+    change(source, "fmi2DoStep(", "fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean b)\n"
+           "{\n    *(volatile int *)c = 1;\n    return *(volatile int *)8;\n}\nfmi2Status elsewhere(")  # fmt: skip
+    said = r"^flotilla: block plain: SIGSEGV at address 0x8, in unit\.so\+0x[0-9a-f]+ \(fmi2DoStep\)$"
+    with pytest.raises(AssertionError) as crashed:
+        run(flotilla_run, build(apps["2"]), LAG_TASK)
+    assert re.search(said, str(crashed.value).replace("\\n", "\n"), re.M), crashed.value
 
 
 def test_sources_with_headers_of_their_own_and_their_prefix(flotilla_run: Path, apps: dict[str, Path]) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -157,7 +158,7 @@ def test_a_block_that_ends_the_process_leaves_outputs_reset(
     tasks: Tasks, tmp_path: Path, manner: str, status: int
 ) -> None:
     """`safe` runs from the last block to the first. One that crashes there keeps no other block from its own, one that
-    hangs no process alive. Seen to fail in all cases: outputs stayed on."""
+    hangs no process alive. Seen to fail in all cases: outputs stayed on. Then, but for exit(), without a word."""
     device = tmp_path / "device"
     bad = f"bad: {{type: misbehave, parameters: {{manner: {manner}, from: 3}}}}\n"
     blocks = (bad + TRACE.format(file=device)) if manner == "safe-hang" else (TRACE.format(file=device) + bad)
@@ -165,6 +166,11 @@ def test_a_block_that_ends_the_process_leaves_outputs_reset(
     assert ended.status == status, ended.err
     check_reset(device)
     assert ("a block has called exit()" in ended.err) == manner.endswith("exit")
+    crash = {"abort": "SIGABRT"}.get(manner, "SIGSEGV") if status < 0 else "nothing"
+    who = "thread bad" if manner.startswith("thread") else "block bad"
+    said = re.search(rf"^flotilla: {who}: {crash} at address 0x\w+, in (\S+)\+0x[0-9a-f]+", ended.err, re.M)
+    assert bool(said) == (status < 0), ended.err
+    assert not said or said[1] == ("misbehave.so" if crash == "SIGSEGV" else "libc.so.6")
 
 
 def test_no_step_follows_when_a_late_one_was_given_up(tasks: Tasks, tmp_path: Path) -> None:

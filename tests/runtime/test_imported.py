@@ -32,6 +32,7 @@ def archive(local_compiler: None, tmp_path: Path) -> Path:
             out.write(file, file.name)
         out.writestr("buildInfo.mat", b"MATLAB 5.0 MAT-file")
         out.writestr("three.mk", "all:\n")
+        out.writestr("defines.txt", "MODEL=three\nMT=1\n")
     return packed
 
 
@@ -43,7 +44,9 @@ def create(archive: Path, name: str = "three", **more: object) -> Path:
 
 def test_an_archive_becomes_an_app_that_runs(archive: Path, flotilla_run: Path) -> None:
     made = create(archive)
-    assert sorted(file.name for file in (made / ert.GENERATED).iterdir()) == ["rtwtypes.h", "three.c", "three.h"]
+    assert sorted(file.name for file in (made / ert.GENERATED).iterdir()) == [
+        "defines.txt", "rtwtypes.h", "three.c", "three.h"
+    ]  # fmt: skip
     assert (made / app.FILE).read_text() == "kind: ert\nmodel: three\n"
     ert.block(made, "three", "three", [], source := archive.parent / "source", HOST)
     (blocks := archive.parent / "blocks").mkdir()

@@ -115,6 +115,14 @@ def test_a_user_without_a_range_is_told_how_to_get_one(monkeypatch: pytest.Monke
     assert "--add-subuids" in message
 
 
+def test_errors_are_shown_though_many_warnings_follow() -> None:
+    """Seen to fail: of a log, its last 30 lines were shown, which were warnings."""
+    warnings = [f"b.c:{n}:1: warning: unused variable 'x{n}'" for n in range(200)]
+    log = ["gcc -c", "a.c:3:2: error: unknown type name 'wheel'", "  wheel x;", *warnings, "make: *** [all] Error 1"]
+    assert namespace.telling("\n".join(log)).splitlines() == [log[1], "…", *log[-30:]]
+    assert namespace.telling("\n".join(log[:20])).splitlines() == log[:20]
+
+
 CHECK = """
 from flotilla.common import namespace
 from flotilla.common.errors import UserError
