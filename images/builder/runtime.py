@@ -69,21 +69,38 @@ def command(work: Path, system: System, argv: Sequence[str], run: toolchain.Run 
 def compile_plugin(
     source: Path, system: System, options: Sequence[str] = WARNINGS, run: toolchain.Run = toolchain.run
 ) -> bytes:
-    """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture."""
+    """A C file, or all of a directory, as a plug-in with blocks for robots of an architecture.
+
+    `options` are for files that include the runtime's headers. Others are another generator's, and their
+    warnings no errors.
+    """
     found = sources.files(source) if source.is_dir() else [source]
     files = [path.name for path in found if path == source or (path.parent == source and path.suffix == ".c")]
     # Its functions keep their names, for the report of a crash, and are nobody else's.
     bound = ["-Wl,-Bsymbolic", "-fno-semantic-interposition"]
-    options = ["-std=c11", *options, *bound, "-I/out/include"]
-    return compile_shared(source, files, system, options, run)
+    common = [*bound, "-I.", "-I/out/include"]
+    place = source if source.is_dir() else source.parent
+    foreign = [name for name in files if not _OURS.search((place / name).read_text(errors="replace"))]
+    own = [name for name in files if name not in foreign]
+    theirs = ["-std=gnu11", *common, *(option for option in options if option != "-Werror")]
+    return compile_shared(source, own, system, ["-std=c11", *common, *options], run, foreign, theirs)
+
+
+_OURS = re.compile(r'^[ \t]*#[ \t]*include[ \t]*[<"]flotilla/', re.MULTILINE)
 
 
 def compile_shared(
-    source: Path, files: Sequence[str], system: System, options: Sequence[str], run: toolchain.Run = toolchain.run
+    source: Path,
+    files: Sequence[str],
+    system: System,
+    options: Sequence[str],
+    run: toolchain.Run = toolchain.run,
+    others: Sequence[str] = (),
+    their_options: Sequence[str] = (),
 ) -> bytes:
     """A C file, or some of a directory, as a shared object for robots of an architecture.
 
-    `files` and paths in `options` are relative to that directory.
+    `files` and paths in `options` are relative to that directory; so are `others`, which have options of their own.
     """
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".plugin-") as directory:
         work = Path(directory)
@@ -92,8 +109,12 @@ def compile_shared(
         else:
             (work / "source").mkdir()
             shutil.copy(source, work / "source")
-        argv = ["env", "-C", "/out/source", "gcc", "-O2", "-shared", "-fPIC", "-s", "-Wl,--build-id=none", *options]
-        command(work, system, [*argv, "-o", "/out/plugin.so", *files, "-lm"], run)
+        gcc, objects = ["env", "-C", "/out/source", "gcc", "-O2", "-fPIC"], []
+        if others:
+            command(work, system, [*gcc, "-c", *their_options, *others], run)
+            objects = [f"{Path(name).stem}.o" for name in others]
+        link = ["-shared", "-s", "-Wl,--build-id=none", *options, "-o", "/out/plugin.so"]
+        command(work, system, [*gcc, *link, *files, *objects, "-lm"], run)
         return (work / "plugin.so").read_bytes()
 
 

@@ -30,6 +30,7 @@ def local_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """This computer's compiler in place of the locked one; outputs in the test's directory."""
 
     def command(work: Path, _: str, argv: Sequence[str], *_run: object) -> None:
+        runtime.copy_sources(work, "include")
         argv = [word.replace("/out", str(work)) for word in argv]
         done = subprocess.run(argv, capture_output=True, text=True, check=False)
         if done.returncode:
