@@ -70,6 +70,8 @@ async def _serve(
         if trouble:
             desk.note(trouble)
         if replay:
+            for said in replay.notes:
+                desk.note(said)
             replay.play(True)
         await _until(ended, arguments.seconds, desk, receiver, replay)
     finally:

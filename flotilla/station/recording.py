@@ -19,6 +19,7 @@ MAGIC = b"FLOTREC1"
 PREFIX = struct.Struct("<8sII")
 CHECK = struct.Struct("<I")
 MOST_HEADER_BYTES = 1 << 24
+_MOST_NS = 1 << 62
 CHUNK_BYTES = 1 << 20
 """Of a file in memory at once, about."""
 _OUTERMOST = 1000
@@ -92,6 +93,8 @@ class Found:
     """Those whose check is good."""
     damaged: int = 0
     """Whole records whose check is wrong."""
+    first_damaged: int | None = None
+    """Where in the file the first of these is, in bytes."""
     rest: int = 0
     """Bytes of half a record at the end: power went, or it is being written now."""
 
@@ -118,6 +121,8 @@ def dtype(kind: str) -> np.dtype[Any]:
 
 
 def _check_field(field: Field, bytes_of_record: int) -> None:
+    if not isinstance(field.name, str) or {type(field.width), type(field.offset)} != {int}:
+        raise ValueError("a field has no name, width or offset")
     if field.type not in CODES or field.width < 1 or field.offset < 0:
         raise ValueError(f"field {field.name} is of no known kind")
     if field.end > bytes_of_record - CHECK.size:
@@ -139,7 +144,9 @@ def parse_header(data: bytes) -> Header:
         if not {"time_ns", "step"} <= {field.name for field in fields} or len({f.name for f in fields}) < len(fields):
             raise ValueError("it lacks time_ns or step, or has a field twice")
         name, period_ns, wall_ns = str(schema["name"]), int(schema["period_ns"]), int(schema["wall_less_monotonic_ns"])
-    except (struct.error, ValueError, KeyError, TypeError) as error:
+        if not 0 < period_ns < _MOST_NS or abs(wall_ns) >= _MOST_NS:
+            raise ValueError("its times are none")
+    except (struct.error, ValueError, KeyError, TypeError, RecursionError) as error:
         raise RecordingError(f"no recording: {error}") from error
     return Header(name, period_ns, wall_ns, fields, bytes_of_header, bytes_of_record)
 
@@ -164,6 +171,8 @@ def chunks(file: Path, found: Found) -> Iterator[Array]:
         while data := opened.read(max(CHUNK_BYTES // length, 1) * length):
             whole, found.rest = divmod(len(data), length)
             good = [_is_good(data[at * length : (at + 1) * length]) for at in range(whole)]
+            if found.first_damaged is None and not all(good):
+                found.first_damaged = header.bytes_of_header + (found.records + good.index(False)) * length
             found.records += sum(good)
             found.damaged += whole - sum(good)
             records = np.frombuffer(data, kind, whole)

@@ -12,6 +12,7 @@ from statistics import median
 from typing import Any
 
 from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 
 from flotilla.common import paths, progress
@@ -46,7 +47,10 @@ class Replay:
 
     def __init__(self, file: Path, known: Iterable[Stream]) -> None:
         self.name = file.name
-        self._messages, kinds = _load(file)
+        damage = mcap_reader.Damage()
+        self._messages, kinds = _load(file, damage)
+        self.notes = damage.notes(file)
+        """What of the file was left out."""
         described = {stream.topic: stream for stream in known}
         self._streams: dict[str, Stream] = {}
         self._kinds: dict[str, Any] = {}
@@ -116,7 +120,7 @@ class Replay:
         self._next = end
 
 
-def _load(file: Path) -> tuple[list[_Message], dict[str, Any]]:
+def _load(file: Path, damage: mcap_reader.Damage) -> tuple[list[_Message], dict[str, Any]]:
     """Messages by time, and classes of what may be streams by topic."""
     messages: list[_Message] = []
     kinds: dict[str, Any] = {}
@@ -127,13 +131,13 @@ def _load(file: Path) -> tuple[list[_Message], dict[str, Any]]:
                 "the most that is replayed; record in parts, or open it in Foxglove"
             )
         with file.open("rb") as opened:
-            for described, channel, data, time_ns in mcap_reader.messages(opened):
+            for described, channel, data, time_ns in mcap_reader.messages(opened, damage):
                 if channel.topic not in kinds:
                     kinds[channel.topic] = mcap_reader.message_class(described)
                 messages.append(_Message(time_ns, channel.topic, data))
     except OSError as error:
         raise UserError(f"{paths.shown(file)}: {error.strerror}; record one: make record OUT=FILE") from error
-    except (McapError, KeyError, TypeError, ValueError) as error:
+    except (McapError, DecodeError, KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"{paths.shown(file)}: is no MCAP file of protobuf messages: {error!r}; record one: make record OUT=FILE"
         ) from error

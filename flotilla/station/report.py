@@ -51,7 +51,8 @@ def read(given: Sequence[Path]) -> tuple[list[Topic], list[str]]:
     """Topics of one MCAP file, or of files of recorders, and what is missing of them. UserError for what is neither."""
     files = segments.files(given)
     if len(files) == 1 and files[0].suffix != segments.SUFFIX:
-        return mcap_reader.read(files[0]), []
+        damage = mcap_reader.Damage()
+        return mcap_reader.read(files[0], damage), damage.notes(files[0])
     if others := [file for file in files if file.suffix != segments.SUFFIX]:
         raise UserError(
             f"{paths.shown(others[0])}: is no file of a recorder, *{segments.SUFFIX}; name one MCAP file alone, or "

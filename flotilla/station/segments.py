@@ -22,6 +22,10 @@ _OWN = ("time_ns", "lost")
 """Fields that a recorder adds, and that are no signals; `step` counts as one."""
 
 
+class _Damaged(UserError):
+    """A file whose beginning is not a recording's, or is gone."""
+
+
 @dataclass(frozen=True)
 class Segment:
     """A file of a recording."""
@@ -47,6 +51,8 @@ class Recorded:
     segments: list[Segment]
     walls_ns: list[int]
     """For each segment, what to add to `time_ns` for nanoseconds since 1970-01-01 UTC."""
+    left_out: list[str] = field(default_factory=list)
+    """Files beside it that are no recordings any more, and why."""
     found: dict[Path, Found] = field(default_factory=dict)
     """Of each file that was read."""
 
@@ -79,13 +85,14 @@ class Recorded:
 
     def notes(self) -> list[str]:
         """What is missing, by what was read so far."""
-        said = []
+        said = list(self.left_out)
         for before, after in pairwise(self.segments):
             if before.number and after.number > before.number + 1:
                 said.append(f"{paths.shown(after.file)}: the files between {before.file.name} and it are missing")
         for file, found in self.found.items():
             if found.damaged:
-                said.append(f"{paths.shown(file)}: {found.damaged} damaged records left out")
+                place = f"the first one at byte {found.first_damaged}"
+                said.append(f"{paths.shown(file)}: {found.damaged} damaged records left out, {place}")
             if found.rest:
                 said.append(f"{paths.shown(file)}: half a record at its end left out, {found.rest} bytes")
         return said
@@ -110,11 +117,18 @@ def files(given: Sequence[Path]) -> list[Path]:
 
 
 def find(given: Sequence[Path]) -> list[Recorded]:
-    """The recordings that these files are, by topic. UserError where one is none, or does not fit the others."""
+    """The recordings that these files are, by topic. UserError where none is one, or one does not fit the others."""
+    wrong: list[_Damaged] = []
     groups: dict[tuple[Path, str], list[Segment]] = {}
     for file in given:
-        segment = _segment(file)
+        try:
+            segment = _segment(file)
+        except _Damaged as error:
+            wrong.append(error)
+            continue
         groups.setdefault((file.resolve().parent, segment.header.name), []).append(segment)
+    if not groups:
+        raise wrong[0]
     topics = _topics(list(groups))
     found = []
     for key, segments in groups.items():
@@ -125,13 +139,15 @@ def find(given: Sequence[Path]) -> list[Recorded]:
     if not found:
         named = ", ".join(paths.shown(file) for file in given)
         raise UserError(f"{named}: no record in it; the recorder writes the first ones when its task has run a moment")
-    return sorted(found, key=lambda recorded: recorded.topic)
+    found.sort(key=lambda recorded: recorded.topic)
+    found[0].left_out = [f"left out: {error}" for error in wrong]
+    return found
 
 
 def _segment(file: Path) -> Segment:
     try:
         if file.stat().st_size == 0:
-            raise UserError(
+            raise _Damaged(
                 f"{paths.shown(file)}: is empty, as after a loss of power; leave it out, the others are whole"
             )
         header = recording.read_header(file)
@@ -141,7 +157,7 @@ def _segment(file: Path) -> Segment:
             f"{paths.shown(file)}: {error.strerror}; name files of a recorder: make fetch brings them from a robot"
         ) from error
     except RecordingError as error:
-        raise UserError(f"{paths.shown(file)}: {error}; leave it out, or fetch it again") from error
+        raise _Damaged(f"{paths.shown(file)}: {error}; leave it out, or fetch it again") from error
     return Segment(file, header, first, last)
 
 

@@ -138,7 +138,7 @@ def test_what_is_damaged_is_left_out_and_told(tmp_path: Path) -> None:
         step for step in range(299) if step != 198
     ]
     assert said[2:] == [
-        f"{second}: 1 damaged records left out",
+        f"{second}: 1 damaged records left out, the first one at byte {len(damaged) - 2 * length}",
         f"{third}: half a record at its end left out, {length - 3} bytes",
     ]
     second.unlink()
@@ -169,10 +169,6 @@ def _other(file: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (_empty, "log-000002.rec: is empty, as after a loss of power; leave it out"),
-        (_truncated, "log-000002.rec: no recording: it ends within its header; leave it out, or fetch it again"),
-        (_foreign, "log-000002.rec: no recording: it does not begin as one; leave it out"),
-        (_long_header, "log-000002.rec: no recording: it ends within its header; leave it out"),
         (_other, "log-000002.rec: count, good, position: other signals than in log-000001.rec"),
         (Path.unlink, "log-000002.rec: No such file or directory; name files of a recorder"),
     ],
@@ -187,6 +183,28 @@ def test_what_is_no_recording_is_named_and_nothing_is_written(
     with pytest.raises(UserError, match=re.escape(reason)):
         convert.convert(made, tmp_path / f"run.{form}")
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (_empty, "log-000002.rec: is empty, as after a loss of power; leave it out"),
+        (_truncated, "log-000002.rec: no recording: it ends within its header; leave it out, or fetch it again"),
+        (_foreign, "log-000002.rec: no recording: it does not begin as one; leave it out"),
+        (_long_header, "log-000002.rec: no recording: it ends within its header; leave it out"),
+    ],
+)
+def test_a_file_whose_beginning_is_damaged_is_left_out_beside_others(
+    tmp_path: Path, spoil: Callable[[Path], None], reason: str
+) -> None:
+    """Seen to fail: it kept the whole files from being read."""
+    made = ring(tmp_path)
+    spoil(made[1])
+    said = convert.convert(made, tmp_path / "run.csv")
+    assert [line for line in said if line.startswith("left out: ") and reason in line]
+    assert len((tmp_path / "run.csv").read_text().splitlines()) == 1 + 200
+    with pytest.raises(UserError, match=re.escape(reason)):
+        convert.convert(made[1:2], tmp_path / "alone.csv")
 
 
 def test_a_recording_without_records_is_no_error_beside_others(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.station import hops, mcap_reader, report
+from flotilla.station.mcap_reader import Damage
 from flotilla.station.record import Recorder
 from flotilla.station.telemetry import streams
 from tests.station import FLEET
@@ -52,7 +53,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_messages_are_read_as_they_were_recorded(recording: Path) -> None:
-    topics = {topic.name: topic for topic in mcap_reader.read(recording)}
+    topics = {topic.name: topic for topic in mcap_reader.read(recording, Damage())}
     valves, control = topics["/robot1/valves/report"], topics["/robot3/control/report"]
     assert list(valves.signals["step"]) == [step for step in range(STEPS) if step not in LOST]
     assert valves.signals["valves"].shape == (STEPS - len(LOST), 8)
@@ -64,7 +65,7 @@ def test_messages_are_read_as_they_were_recorded(recording: Path) -> None:
 
 def test_loss_is_counted_and_hops_are_measured(recording: Path) -> None:
     """Seen to fail with the stamps sorted by name."""
-    topics = {topic.name: topic for topic in mcap_reader.read(recording)}
+    topics = {topic.name: topic for topic in mcap_reader.read(recording, Damage())}
     accounts = {name: report.account(topic) for name, topic in topics.items()}
     assert accounts["/robot1/valves/report"].lost == len(LOST)
     assert accounts["/robot1/valves/report"].longest_gap_s == pytest.approx(0.03)
@@ -98,7 +99,7 @@ def test_a_recording_that_was_cut_off_is_read_as_far_as_it_goes(recording: Path,
     cut = tmp_path / "cut.mcap"
     content = recording.read_bytes()
     cut.write_bytes(content[: len(content) * 2 // 3])
-    topics = {topic.name: topic for topic in mcap_reader.read(cut)}
+    topics = {topic.name: topic for topic in mcap_reader.read(cut, Damage())}
     steps = list(topics["/robot1/valves/report"].signals["step"])
     assert 100 < len(steps) < STEPS - len(LOST)
     assert steps == [step for step in range(STEPS) if step not in LOST][: len(steps)]

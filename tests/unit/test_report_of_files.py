@@ -156,8 +156,9 @@ def test_what_is_damaged_is_on_the_page_and_foreign_files_are_refused(tmp_path: 
     with pytest.raises(UserError, match=r"a\.mcap: is no file of a recorder, \*\.rec; name one MCAP file alone"):
         report.write([made[0], tmp_path / "a.mcap"], tmp_path / "other.html")
     made[0].write_bytes(b"")
+    assert "left out: " in report.write([tmp_path], tmp_path / "page.html").read_text()
     with pytest.raises(UserError, match=r"log-000001\.rec: is empty"):
-        report.write([tmp_path / "log-*.rec"], tmp_path / "other.html")
+        report.write([made[0]], tmp_path / "other.html")
     assert not (tmp_path / "other.html").exists()
 
 
