@@ -25,12 +25,16 @@ VIRTUAL = (
 
 
 def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios", how: str = VIRTUAL) -> Path:
-    """`flights` by title, `how` they were flown; the path of the page, which is called `name`."""
+    """`flights` by title, `how` they were flown; the path of the page, which is called `name`. Beside it lie the figures
+    as JSON and, where a path was flown, the picture of the first one's trajectory: docs/flight.svg is one."""
     directory.mkdir(parents=True, exist_ok=True)
     found = {title: summary(flight) for title, flight in flights.items()}
     (directory / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n")
     page = directory / f"{name}.html"
     pictures = {title: _pictures(flight) for title, flight in flights.items()}
+    if trajectories := [pictures[title][0] for title, flight in flights.items() if flight.completed]:
+        picture = trajectories[0].replace("<svg ", '<svg style="background: #ffffff" ', 1)  # pages may be dark
+        (directory / f"{name}.svg").write_text(picture)
     hops = {
         title: {name: flight.hop(index) for index, name in enumerate(HOPS)} if flight.one_clock else {}
         for title, flight in flights.items()

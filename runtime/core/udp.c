@@ -243,7 +243,7 @@ bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns
         now_ns = fl_now_ns();
         if (!good)
             continue;
-        int64_t stamp_ns = read_stamp(&message), wall_ns = now_ns + wall_less_monotonic_ns();
+        int64_t stamp_ns = read_stamp(&message), wall_ns = now_ns + fl_wall_less_monotonic_ns();
         int64_t came_ns = udp_arrival_ns(stamp_ns, wall_ns, now_ns, receiver->emptied_ns);
         if (fl_failover_takes(&receiver->failover, rank, came_ns, receiver->failover_timeout)) {
             receiver->sender = (uint32_t)rank;

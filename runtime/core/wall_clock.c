@@ -11,7 +11,7 @@ enum {
 
 /* An interruption between the two clocks makes the difference wrong by half of its duration, so the closest pair of
  * readings counts. */
-int64_t wall_less_monotonic_ns(void)
+int64_t fl_wall_less_monotonic_ns(void)
 {
     int64_t closest_ns = INT64_MAX, difference_ns = 0;
     for (int i = 0; i < READINGS && closest_ns > CLOSE_NS; i++) {

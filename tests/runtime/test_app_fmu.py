@@ -160,6 +160,29 @@ def test_a_unit_of_fmi_3_with_variables_of_all_kinds(flotilla_run: Path, apps: d
     assert (last["plain.letters"], last["other.letters"]) == (len('a "b"'), len("lag"))
 
 
+OWN_NAMES = """
+double json_number(double value), fl_now_ns(double value);
+double json_number(double value) { return value; }
+double fl_now_ns(double value) { return value; }
+"""
+
+
+def test_a_unit_gets_its_own_functions(flotilla_run: Path, apps: dict[str, Path]) -> None:
+    """A binary whose names are also those of the program that loads it, private and public ones. Seen to fail: the
+    program's json_number() ended the process, and its fl_now_ns() gave the time for the unit's value."""
+    source = apps["2"] / "unit" / "sources" / "lag.c"
+    change(source, "#include <math.h>\n", "#include <math.h>\n" + OWN_NAMES)
+    change(source, "exp(", "fl_now_ns(1) * json_number(1) * exp(")
+    unit = read(apps["2"])
+    place = apps["2"] / "unit" / BINARIES["2"].format(unit.identifier)
+    place.parent.mkdir(parents=True)
+    headers = paths.PROJECT / "flotilla" / "apps" / "fmi"
+    subprocess.run(["cc", "-shared", "-fPIC", f"-I{headers}", "-o", place, source, "-lm"], check=True)
+    shutil.rmtree(source.parent)
+    rows = run(flotilla_run, build(apps["2"]), LAG_TASK, watch="plain.y")
+    assert [row["plain.y"] for row in rows] == pytest.approx(lag(2, 0.5, 30), rel=1e-9)
+
+
 def test_what_the_xml_says(apps: dict[str, Path]) -> None:
     unit = read(apps["3"])
     assert [(each.name, each.type, each.width) for each in unit.inputs] == [

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from flotilla.common import paths
 
@@ -19,6 +22,20 @@ def test_blocks_are_listed_with_ports_units_and_source(flotilla_run: Path) -> No
     wrong = subprocess.run([program, "gian"], capture_output=True, text=True, check=False)
     assert wrong.returncode == 2
     assert "the nearest is gain" in wrong.stderr
+
+
+@pytest.mark.parametrize("name", ["flotilla-run", "flotilla-blocks"])
+def test_a_program_exports_the_interface_of_blocks_alone(flotilla_run: Path, name: str) -> None:
+    """Seen to fail with 186 functions of its own, which took the place of those of plug-ins and units. The C library's
+    variables have a version."""
+    listed = subprocess.run(
+        ["nm", "-D", "--defined-only", flotilla_run.with_name(name)], capture_output=True, text=True, check=True
+    ).stdout
+    exported = {line.split()[-1] for line in listed.splitlines()}
+    public = (paths.PROJECT / "runtime" / "include" / "flotilla").glob("*.h")
+    declared = set(re.findall(r"\b(fl_\w+)\(", "".join(path.read_text() for path in public)))
+    assert {symbol for symbol in exported if "@" not in symbol and not symbol.startswith("fl_")} == set()
+    assert declared - exported <= {"fl_interval_s"}, "an inline function"
 
 
 def test_a_leak_of_an_app_is_its_own(flotilla_run: Path) -> None:

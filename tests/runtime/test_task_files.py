@@ -190,6 +190,32 @@ def test_plugins_come_from_several_directories_where_one_may_be_missing(tasks: T
         assert (done.returncode, done.stderr) == (0, "")
 
 
+OWN_NAMES = """
+#include <flotilla/block.h>
+#include <stdio.h>
+size_t parameter_size(int);
+size_t parameter_size(int kind) { return 40 + (size_t)kind; }
+double json_number(double);
+double json_number(double value) { return value / 2; }
+static const struct fl_port out = {"out", FL_DOUBLE, 1, 0, "", ""};
+static int step(struct fl_block *block)
+{
+    FL_OUT(block, 0, double) = (double)parameter_size(2) + json_number(1);
+    return FL_OK;
+}
+FL_BLOCK(named) = {.abi = FL_ABI, .name = "named", .summary = "", .source = "", .outputs = &out, .output_count = 1,
+                   .step = step};
+"""
+
+
+def test_a_plugin_gets_its_own_functions(tasks: Tasks, tmp_path: Path) -> None:
+    """Seen to fail: parameter_size() was the program's of that name, and gave 8."""
+    (tmp_path / "named.c").write_text(OWN_NAMES)
+    own = Tasks(tasks.program, tmp_path, tmp_path)
+    compile_shared(tmp_path / "named.c", tmp_path / "named.so", f"-I{HEADERS}")
+    assert [row["a.out"] for row in own.run(task("a: {type: named}"), "--steps", "1", "--watch", "a.out").rows] == [42.5]
+
+
 def test_the_graph_names_blocks_and_wires(tasks: Tasks) -> None:
     text = task("a: {type: gain, every: 2, in: {in: 1}}\nb: {type: gain, in: {in: a.out}}")
     drawn = subprocess.run(tasks.argv(text, "--dot"), capture_output=True, text=True, check=True).stdout

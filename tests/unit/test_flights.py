@@ -92,3 +92,16 @@ def test_the_page_marks_what_is_late_and_what_cannot_be(tmp_path: Path) -> None:
     assert marks(flight(2000)) == 0
     assert marks(flight(12_000)) == 2
     assert marks(flight(2000, last_hop_us=-21)) == 1
+
+
+def test_the_trajectory_is_a_file_of_its_own(tmp_path: Path) -> None:
+    """The README shows one. Seen to fail: that picture had to be cut out of the page."""
+    report.write({"no path": flight(2000)}, tmp_path)
+    assert not (tmp_path / "scenarios.svg").exists()
+    found = flight(2000)
+    found.controls = [
+        {"number": number, "time_ns": number * PERIOD_NS // 2, "flying": True, "done": number == 2, "wanted": (0.1, 0)}
+        for number in range(3)
+    ]
+    report.write({"no path": flight(2000), "square": found}, tmp_path)
+    assert "Trajectory" in (tmp_path / "scenarios.svg").read_text()

@@ -138,7 +138,7 @@ static int64_t taken_ns(const dc1394video_frame_t *frame)
 {
     enum { PLAUSIBLE_US = 1000 * 1000 };
     int64_t now_ns = fl_now_ns();
-    int64_t age_us = (now_ns + wall_less_monotonic_ns()) / 1000 - (int64_t)frame->timestamp;
+    int64_t age_us = (now_ns + fl_wall_less_monotonic_ns()) / 1000 - (int64_t)frame->timestamp;
     return age_us > 0 && age_us < PLAUSIBLE_US ? now_ns - age_us * 1000 : now_ns;
 }
 

@@ -189,7 +189,7 @@ static int64_t arrival(struct msghdr *message)
 {
     enum { PLAUSIBLE_NS = 1000 * 1000 * 1000 };
     struct timespec stamp;
-    int64_t now_ns = fl_now_ns(), wall_ns = now_ns + wall_less_monotonic_ns(), age_ns = 0;
+    int64_t now_ns = fl_now_ns(), wall_ns = now_ns + fl_wall_less_monotonic_ns(), age_ns = 0;
     for (struct cmsghdr *part = CMSG_FIRSTHDR(message); part; part = CMSG_NXTHDR(message, part)) {
         if (part->cmsg_level != SOL_SOCKET || part->cmsg_type != SCM_TIMESTAMPNS)
             continue;

@@ -56,7 +56,7 @@ static const struct fl_port outputs[] = {
 static int step(struct fl_block *block)
 {
     struct state *state = block->state;
-    int64_t offset = wall_less_monotonic_ns();
+    int64_t offset = fl_wall_less_monotonic_ns();
     if (block->step == 0)
         state->begin_ns = block->release_ns;
     FL_OUT(block, TIME, double) = 1e-9 * (double)(block->release_ns - state->begin_ns);

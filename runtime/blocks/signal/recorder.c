@@ -253,7 +253,7 @@ static void make_header(struct state *state)
     memcpy(writer->header, "FLOTREC1", 8);
     put_uint32((uint8_t *)writer->header + 8, (uint32_t)writer->header_bytes);
     put_uint32((uint8_t *)writer->header + 12, (uint32_t)state->record_bytes);
-    size_t used = write_schema(state, wall_less_monotonic_ns(), schema, size);
+    size_t used = write_schema(state, fl_wall_less_monotonic_ns(), schema, size);
     memset(schema + used, ' ', size - used);
 }
 

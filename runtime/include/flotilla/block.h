@@ -237,11 +237,11 @@ struct fl_block_type {
  * The executive finds it in a program by itself, and in a shared object (a plug-in) through fl_blocks().
  */
 #define FL_BLOCK(identifier)                                                                                           \
-    static const struct fl_block_type fl_type_##identifier;                                                            \
+    static const struct fl_block_type fl_block_type_##identifier;                                                      \
     __attribute__((used,                                                                                               \
                    section("flotilla_blocks"))) static const struct fl_block_type *const fl_announced_##identifier =   \
-        &fl_type_##identifier;                                                                                         \
-    static const struct fl_block_type fl_type_##identifier
+        &fl_block_type_##identifier;                                                                                   \
+    static const struct fl_block_type fl_block_type_##identifier
 
 extern const struct fl_block_type *const __start_flotilla_blocks[] __attribute__((visibility("hidden"), weak));
 extern const struct fl_block_type *const __stop_flotilla_blocks[] __attribute__((visibility("hidden"), weak));
