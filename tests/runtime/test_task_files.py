@@ -213,7 +213,9 @@ def test_a_plugin_gets_its_own_functions(tasks: Tasks, tmp_path: Path) -> None:
     (tmp_path / "named.c").write_text(OWN_NAMES)
     own = Tasks(tasks.program, tmp_path, tmp_path)
     compile_shared(tmp_path / "named.c", tmp_path / "named.so", f"-I{HEADERS}")
-    assert [row["a.out"] for row in own.run(task("a: {type: named}"), "--steps", "1", "--watch", "a.out").rows] == [42.5]
+    assert [row["a.out"] for row in own.run(task("a: {type: named}"), "--steps", "1", "--watch", "a.out").rows] == [
+        42.5
+    ]
 
 
 def test_the_graph_names_blocks_and_wires(tasks: Tasks) -> None:
