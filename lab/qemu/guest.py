@@ -17,7 +17,7 @@ from flotilla.fleet.model import Board
 from lab.qemu import qemu
 from lab.qemu.console import SerialConsole
 from lab.qemu.process import Emulator, Exited
-from lab.qemu.timing import LabError, Steps
+from lab.qemu.timing import Deadline, Expired, LabError, Steps
 
 _SAVED_MACHINE, _SAVED_CARD = "machine", "card.qcow2"
 _STATE_SECONDS = 600
@@ -168,6 +168,10 @@ class Guest:
         self.execute("migrate-set-parameters", max_bandwidth=_STATE_BYTES_S)
         self._migrate("migrate", f"exec:cat >{shlex.quote(str(directory / _SAVED_MACHINE))}")
         shutil.copyfile(self._overlay, directory / _SAVED_CARD)  # which nobody writes to before it goes on
+        deadline = Deadline(_STATE_SECONDS)
+        while self.execute("query-status")["status"] == "finish-migrate":  # no event tells when that is over
+            if deadline.expired:
+                raise Expired(f"{self.name}: saved, but not within {deadline.seconds:g} s")
         self.execute("cont")
 
     def restore(self, directory: Path) -> None:
