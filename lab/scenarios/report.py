@@ -25,8 +25,10 @@ VIRTUAL = (
 
 
 def write(flights: Mapping[str, Flight], directory: Path, name: str = "scenarios", how: str = VIRTUAL) -> Path:
-    """`flights` by title, `how` they were flown; the path of the page, which is called `name`. Beside it lie the figures
-    as JSON and, where a path was flown, the picture of the first one's trajectory: docs/flight.svg is one."""
+    """`flights` by title, `how` they were flown; the path of the page, which is called `name`.
+
+    Beside it lie the figures as JSON and, where a path was flown, the picture of the first one's trajectory:
+    docs/flight.svg is one."""
     directory.mkdir(parents=True, exist_ok=True)
     found = {title: summary(flight) for title, flight in flights.items()}
     (directory / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n")
