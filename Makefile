@@ -57,25 +57,25 @@ size: | setup ## the largest packages and files of a robot's image
 
 ##@ Fleet
 .PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave station-time
-fleet: | setup-lab ## a virtual fleet of guests in the background, to try things on: make fleet N=4 [LINK=ibss]
+fleet: | setup-station setup-lab ## a virtual fleet of guests in the background, to try things on: make fleet N=4 [LINK=ibss]
 	$(Q)$(FLOTILLA) fleet up $(call need,N) $(call option,--link,LINK)
 
-fleet-status: | setup-lab ## what the guests of the virtual fleet do
+fleet-status: | setup-station setup-lab ## what the guests of the virtual fleet do
 	$(Q)$(FLOTILLA) fleet status
 
-fleet-down: | setup-lab ## end the virtual fleet
+fleet-down: | setup-station setup-lab ## end the virtual fleet
 	$(Q)$(FLOTILLA) fleet down
 
-wheeled: | setup-lab setup-runtime ## wheeled robots in a room, to be driven from this computer, until Ctrl-C: make wheeled [N=1] [ROOM=corner]
+wheeled: | setup-station setup-lab setup-runtime ## wheeled robots in a room, to be driven from this computer, until Ctrl-C: make wheeled [N=1] [ROOM=corner]
 	$(Q)$(FLOTILLA) wheeled $(call option,--room,ROOM) $(if $(value N),$(call given,N))
 
-wheeled-down: | setup-lab setup-runtime ## end them
+wheeled-down: | setup-station setup-lab setup-runtime ## end them
 	$(Q)$(FLOTILLA) wheeled-down
 
-fleet-scale: | setup-lab ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
+fleet-scale: | setup-station setup-lab ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
 	$(Q)$(FLOTILLA) fleet-scale $(call need,N) $(call option,--board,BOARD)
 
-radio-capacity: | setup ## how many robots one radio cell carries, simulated [INVENTORY=dir STANDARD=b|b-short|g|g-mixed RATE=11M AREA=10 PHASES=random UPDATE=1 LIMIT=10 MISSED=1 COMPUTE=400 SEED=1]
+radio-capacity: | setup-station ## how many robots one radio cell carries, simulated [INVENTORY=dir STANDARD=b|b-short|g|g-mixed RATE=11M AREA=10 PHASES=random UPDATE=1 LIMIT=10 MISSED=1 COMPUTE=400 SEED=1]
 	$(Q)$(FLOTILLA) radio-capacity $(call option,--inventory,INVENTORY) $(call option,--standard,STANDARD) $(call option,--rate,RATE) \
 	    $(call option,--area,AREA) $(call option,--phases,PHASES) $(if $(filter-out 0,$(UPDATE)),--update) $(call option,--limit,LIMIT) \
 	    $(call option,--missed,MISSED) $(call option,--compute,COMPUTE) $(call option,--seconds,SECONDS) $(call option,--seed,SEED)
@@ -123,9 +123,15 @@ cve: | setup ## known vulnerabilities of what the locks hold, by Debian's tracke
 check-fleet: | setup ## validate the fleet's description
 	$(Q)$(FLOTILLA) check-fleet
 
-requirements: | setup ## lock the Python environment anew from requirements.in
-	$(Q)$(by_pip_settings) $(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	    --no-header --no-annotate --quiet requirements.in -o requirements.lock
+# One resolution of all groups, which keeps what is locked, then the part of each: no two have different versions.
+all_inputs = requirements/build.in requirements/station.in requirements/tests.in
+locked = $(PYTHON) images/pip_settings.py $(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes \
+    --no-emit-index-url --no-header --no-annotate --quiet
+requirements: | setup ## lock the groups of the Python environment anew: requirements/*.in
+	$(Q)cat $(all_inputs:in=lock) >$(BUILD)/requirements.lock
+	$(Q)$(locked) $(all_inputs) -o $(BUILD)/requirements.lock
+	$(Q)set -e; for each in $(all_inputs:.in=); do \
+	    $(locked) -c $(BUILD)/requirements.lock $$each.in -o $$each.lock; done
 
 ##@ Keys
 .PHONY: rotate-key revoke-key admit-operator revoke-operator operators backup-keys restore-keys
@@ -156,10 +162,10 @@ restore-keys: | setup ## put them back: make restore-keys FILE=FILE [PASSWORD_FI
 check: | setup-tests lint check-runtime ## lint, types and unit tests, of the runtime too; no images, no QEMU
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 
-docs: | setup ## the documentation as a site, in build/docs/index.html; warnings are errors, nothing is fetched
+docs: | $(VENV)/.tests ## the documentation as a site, in build/docs/index.html; warnings are errors, nothing is fetched
 	$(Q)$(step) "documentation" $(VENV)/bin/sphinx-build -q -E -W --keep-going -d $(BUILD)/docs/.doctrees docs $(BUILD)/docs
 
-reference: | setup runtime ## write the pages of docs/reference that are made from the sources
+reference: | setup-station runtime ## write the pages of docs/reference that are made from the sources
 	$(Q)$(PYTHON) -m flotilla.reference
 
 lint: | setup-tests docs
@@ -242,7 +248,7 @@ coverage: | setup-tests ## branches of Python and C that unit and runtime tests 
 	    --html-nested $(coverage_report)/c/index.html --print-summary $(covered)/runtime
 	$(Q)! grep -v -x 0 $(covered)/status
 
-power-cuts: | setup-lab setup-runtime ## every power cut of updates replayed: bricks, wrong releases, mistakes found [BOARD=] [MIB=16]
+power-cuts: | setup-station setup-lab setup-runtime ## every power cut of updates replayed: bricks, wrong releases, mistakes found [BOARD=] [MIB=16]
 	$(Q)$(FLOTILLA) power-cuts $(call option,--board,BOARD) $(call option,--mib,MIB)
 
 bench: | setup-tests ## wall times and ratios against other builders
@@ -261,7 +267,7 @@ runtime: | setup-runtime ## the runtime's programs for this computer, in build/r
 	$(Q)mkdir -p $(BUILD); flock $(BUILD)/.runtime.lock sh -e -c $(call quoted,$(call \
 	    configured,$(BUILD)/runtime); $(call compile,$(BUILD)/runtime))
 
-check-runtime: | setup-runtime ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
+check-runtime: | setup-runtime $(VENV)/.tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
 	$(Q)$(step) "format of C" $(VENV)/bin/clang-format --dry-run -Werror $$(git ls-files '*.[ch]')
 	$(Q)set -e; $(call configured,$(BUILD)/runtime-sanitized,,-Dtests=true \
 	    -Db_sanitize=address$(comma)undefined -Dbuildtype=debugoptimized)
@@ -285,35 +291,35 @@ bench-runtime: | setup-runtime runtime ## what a block costs, beside LinuxCNC's 
 	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(call option,--seconds,SECONDS) \
 	    $(call option,--rounds,ROUNDS)
 
-station: | setup ## a page to see the fleet, drive, tune and record it [PORT=8080 ADDRESS=127.0.0.1 OUT=file INVENTORY=]; show a recording: REPLAY=file
+station: | setup-station ## a page to see the fleet, drive, tune and record it [PORT=8080 ADDRESS=127.0.0.1 OUT=file INVENTORY=]; show a recording: REPLAY=file
 	$(Q)$(FLOTILLA) station $(call option,--inventory,INVENTORY) $(call option,--port,PORT) $(call option,--page-address,ADDRESS) $(call option,--record,OUT) \
 	    $(call option,--replay,REPLAY) $(call option,--seconds,SECONDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
 station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)
-record: | setup ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS= INVENTORY=]
+record: | setup-station ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS= INVENTORY=]
 	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
 
-live: | setup ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
+live: | setup-station ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
 	$(Q)$(FLOTILLA) live $(station) $(call option,--record,OUT) $(call each_given,PORT)
 
-top: | setup ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
+top: | setup-station ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
 	$(Q)$(FLOTILLA) top $(station) $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
 
-drive: | setup ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN] [INVENTORY=]
+drive: | setup-station ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN] [INVENTORY=]
 	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT) $(call option,--inventory,INVENTORY)
 
-positions: | setup ## positions of the indoor positioning system to a robot, with proof: make positions ROBOT=3 [PORT=5010] [INTERFACE=eth1] [STATION=] [INVENTORY=]
+positions: | setup-station ## positions of the indoor positioning system to a robot, with proof: make positions ROBOT=3 [PORT=5010] [INTERFACE=eth1] [STATION=] [INVENTORY=]
 	$(Q)$(FLOTILLA) positions $(call need,ROBOT) $(call option,--port,PORT) $(call option,--interface,INTERFACE) \
 	    $(call option,--station,STATION) $(call option,--inventory,INVENTORY)
 
 fetch: | setup ## recorder files of a robot's task: make fetch ROBOT=3 TASK=heading [OUT=directory]
 	$(Q)$(FLOTILLA) fetch $(call need,ROBOT) $(call need,TASK) $(call option,--out,OUT)
 
-convert: | setup ## MCAP, CSV or MAT of files of a recorder: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat
+convert: | setup-station ## MCAP, CSV or MAT of files of a recorder: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat
 	$(Q)$(FLOTILLA) convert $(call need,OUT) $(call need_each,FILE)
 
-report: | setup ## a page of recordings: paths, commands, hops, latency: make report FILE=run.mcap|"log-*.rec" [OUT=page.html]
+report: | setup-station ## a page of recordings: paths, commands, hops, latency: make report FILE=run.mcap|"log-*.rec" [OUT=page.html]
 	$(Q)$(FLOTILLA) report $(call option,--out,OUT) $(call need_each,FILE)
 
 param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
@@ -333,7 +339,7 @@ latency: | setup-lab setup-runtime ## latency in virtual time against the accept
 hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
 	$(Q)$(FLOTILLA) hwcheck $(call need,ROBOT) $(call option,--seconds,SECONDS)
 
-accept: | setup-lab setup-runtime ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 RELAYS=1 WATCHDOG=1]
+accept: | setup-station setup-lab setup-runtime ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 RELAYS=1 WATCHDOG=1]
 	$(Q)$(FLOTILLA) accept $(call need,ROBOT) $(call option,--plan,PLAN) $(call option,--seconds,SECONDS) $(if $(filter-out 0,$(RELAYS)),--relays) \
 	    $(if $(filter-out 0,$(WATCHDOG)),--watchdog)
 
@@ -343,31 +349,36 @@ latency-accept: | setup-lab setup-runtime ## measure both kernels, or KERNEL=, a
 boot-time: | setup-lab setup-runtime ## where a boot spends its time, in virtual time
 	$(Q)$(FLOTILLA) boot-time $(measured)
 
-scenarios: | setup-lab setup-runtime ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ON=lockstep | ROBOTS=16]
+scenarios: | setup-station setup-lab setup-runtime ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ON=lockstep | ROBOTS=16]
 	$(Q)$(FLOTILLA) scenarios $(addprefix --,$(filter guests lockstep,$(ON))) $(call option,--link,LINK) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
 
-scenarios-accept: | setup-lab setup-runtime ## make a new run the accepted one: commit lab/scenarios/baseline.json
+scenarios-accept: | setup-station setup-lab setup-runtime ## make a new run the accepted one: commit lab/scenarios/baseline.json
 	$(Q)$(FLOTILLA) scenarios-accept
 
 ##@ Housekeeping
-.PHONY: setup setup-lab setup-runtime setup-tests clean help
-setup: $(VENV)/.installed ## install what building needs
+.PHONY: setup setup-station setup-lab setup-runtime setup-tests clean help
+setup: $(VENV)/.build ## install what building needs
 
 # Git, or the program that unpacked an archive, may have ended lines with CR LF, which shells do not accept.
 $(if $(shell grep -l "$$(printf '\r')" images/install-host-packages Makefile),$(error the files of this checkout end their \
     lines with CR LF; take a new clone of the repository, or unpack the archive without a conversion of texts))
 
-# One make at a time sets the environment up.
-alone = mkdir -p $(BUILD); exec 9>$(BUILD)/.venv.lock; \
-    flock -n 9 || { echo "$(VENV): another make sets it up; waiting for that" >&2; flock 9; }
+# The Python environment has what the locks of its groups name: what a command does not need is not installed for it.
+set_up = $(Q)images/set-up-python $(VENV) $(patsubst .%,%,$(@F))
+.PHONY: unusable
+# Of another Python, of another place, or of another checkout's packages.
+unusable := $(if $(shell images/environment-state $(VENV)),unusable,\
+    $(if $(filter $(shell pwd -P),$(file <$(VENV)/.installed)),,unusable))
+$(VENV)/.build: requirements/build.lock images/host-packages.txt pyproject.toml $(unusable)
+	$(set_up)
 
-# Ansible's plugins and the command `flotilla` find the packages of this checkout: of another place's they know nothing.
-ifneq ($(file <$(VENV)/.installed),$(shell pwd -P))
-.PHONY: $(VENV)/.installed
-endif
-$(VENV)/.installed: $(VENV)/.complete pyproject.toml
-	$(Q)set -e; $(alone); \
-	    $(VENV)/bin/pip install --quiet --no-index --no-deps --no-build-isolation --editable .; sync -f $(VENV); pwd -P >$@
+$(VENV)/.station: requirements/station.lock $(VENV)/.build
+	$(set_up)
+
+$(VENV)/.tests: requirements/tests.lock requirements/tests-source.lock $(VENV)/.station
+	$(set_up)
+
+setup-station: $(VENV)/.station ## install what a station needs: its page, recordings and reports
 
 # Each command installs what it needs: guests, the runtime for this computer, a browser for the tests of pages.
 setup-lab: setup ## install what guests need
@@ -376,31 +387,8 @@ setup-lab: setup ## install what guests need
 setup-runtime: setup ## install what the runtime for this computer needs
 	$(Q)images/install-host-packages tests/runtime-packages.txt
 
-setup-tests: setup ## install what testing needs
+setup-tests: $(VENV)/.tests ## install what testing needs
 	$(Q)images/install-host-packages tests/host-packages.txt tests/lab-packages.txt tests/runtime-packages.txt
-
-# pip brings uv alone: that installs all others in a quarter of pip's time.
-new_venv = "$$python" -m venv "$$(cd $(BUILD) && pwd -P)/venv"; \
-    sed -n '/^uv==/,/[^\\]$$/p' requirements.lock >$(VENV)/uv.lock; \
-    $(by_pip_settings) $(VENV)/bin/pip install --quiet --require-hashes --only-binary :all: -r $(VENV)/uv.lock; \
-    $(uv_install) --only-binary :all: -r requirements.lock; \
-    $(uv_install) --no-deps --no-build-isolation -r requirements-source.lock
-by_pip_settings = $(PYTHON) images/pip_settings.py
-uv_install = $(by_pip_settings) $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes
-locked_by = requirements.lock requirements-source.lock images/host-packages.txt
-.PHONY: unusable
-$(VENV)/.complete: $(locked_by) $(if $(shell images/environment-state $(VENV)),unusable)
-	$(Q)images/check-host
-	$(Q)images/find-python --before-packages >/dev/null
-	$(Q)images/install-host-packages images/host-packages.txt
-	@# The last good one comes back where the new one fails. It cannot be made beside: its programs name its place.
-	$(Q)set -e; $(alone); why=$$(images/environment-state $(VENV)); \
-	    test ! -e $@ -o -n "$$why" -o -n "$$(find $(locked_by) -newer $@ 2>&1)" || exit 0; \
-	    test -z "$$why" || echo "$(VENV) $$why: it is made anew" >&2; python=$$(images/find-python); \
-	    test ! -e $@ || { rm -rf $(VENV).before; mv $(VENV) $(VENV).before; }; \
-	    trap 'test -e $@ || test ! -e $(VENV).before || { rm -rf $(VENV); mv $(VENV).before $(VENV); }' EXIT; \
-	    trap 'exit 1' HUP INT TERM; \
-	    rm -rf $(VENV); $(new_venv); sync -f $(VENV); touch $@; rm -rf $(VENV).before
 
 clean: ## remove all outputs; keys stay
 	$(Q)rm -rf $(BUILD)

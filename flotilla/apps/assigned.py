@@ -80,7 +80,7 @@ def key_of(directory: Path, *words: str) -> str:
     """
     package, project = Path(__file__).parent, paths.PROJECT
     used = [package, project / "images/builder", project / "flotilla/fleet", project / "flotilla/common"]
-    return cache.digest(*words, directory, *behind_links(directory), *used, project / "requirements.lock")
+    return cache.digest(*words, directory, *behind_links(directory), *used, project / "requirements/build.lock")
 
 
 def behind_links(directory: Path) -> list[Path]:

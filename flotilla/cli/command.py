@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 
 def no_arguments(_: argparse.ArgumentParser) -> None:
@@ -22,6 +23,8 @@ class Command:
     run: Callable[[argparse.Namespace], None]
     """Does it; prints the result on standard output, raises UserError where the user can help."""
     arguments: Callable[[argparse.ArgumentParser], None] = no_arguments
+    packages: Literal["build", "station"] = "build"
+    """The group of requirements/ that has the Python packages which both functions import."""
 
 
 def robot_argument(parser: argparse.ArgumentParser) -> None:

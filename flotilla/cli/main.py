@@ -16,6 +16,9 @@ from flotilla.common.errors import UserError
 GROUP = "flotilla.commands"
 """Entry points, each a tuple of `Command`, in pyproject.toml: so the lab has commands, and nothing here knows it."""
 
+OURS = ("flotilla", "images", "lab")
+"""Packages of this checkout, which no group of requirements/ brings."""
+
 
 def commands() -> list[Command]:
     return [command for found in sorted(entry_points(group=GROUP), key=lambda e: e.name) for command in found.load()]
@@ -59,12 +62,22 @@ def main() -> int:
     os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"  # there are none, and to look for them reads every package
     known = commands()
     word = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
-    arguments = parser(known, lambda command: word in (command.name, "completion")).parse_args()
     try:
+        arguments = parser(known, lambda command: word in (command.name, "completion")).parse_args()
         paths.check()
         next(command for command in known if command.name == arguments.command).run(arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        group = next(command.packages for command in known if command.name == word)
+        module = (error.name or "").split(".")[0]
+        if group == "build" or module in OURS:
+            raise
+        print(
+            f"error: flotilla {word}: the Python package {module} is not installed; `make setup-{group}` installs it",
+            file=sys.stderr,
+        )
         return 1
     except KeyboardInterrupt as interrupt:
         print(f"error: interrupted; {str(interrupt) or 'the last good outputs are untouched'}", file=sys.stderr)

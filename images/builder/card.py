@@ -173,7 +173,7 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
     key = cache.digest(
         slot.name, tools.directory.name, str(epoch), board.model_dump_json(), *SOURCES, Path(__file__),
         Path(filesystem.__file__), Path(environment_block.__file__), Path(copying.__file__), Path(uefi.__file__),
-        paths.PROJECT / "requirements.lock",  # jinja2
+        paths.PROJECT / "requirements/build.lock",  # jinja2
     )  # fmt: skip
 
     def make(out: Path) -> None:

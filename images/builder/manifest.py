@@ -188,7 +188,7 @@ def shared(board: Board, locks: tuple[Lock, Lock], root: Path, content: Path, ba
     lock, tools_lock = locks
     key = cache.digest(
         board.name, lock.digest, tools_lock.digest, root.name, base.name, tools.directory.name,
-        paths.PROJECT / "requirements.lock", Path(__file__),
+        paths.PROJECT / "requirements/build.lock", Path(__file__),
     )  # fmt: skip
 
     def make(out: Path) -> None:
@@ -474,7 +474,7 @@ def inputs_of_board(board: Board, locks: tuple[Lock, Lock]) -> str:
     return cache.digest(
         *(lock.digest for lock in locks), rootfs.key(board, *locks), *card.SOURCES, slot.RELEASE_FILE,
         images / "builder", paths.PROJECT / "flotilla" / "fleet", paths.PROJECT / "flotilla" / "common",
-        paths.PROJECT / "requirements.lock",
+        paths.PROJECT / "requirements/build.lock",
         board.model_dump_json(),
     )  # fmt: skip
 

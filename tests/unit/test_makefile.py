@@ -82,7 +82,9 @@ def make(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60, check=False)
 
 
-UNPREPARED = [word for target in ("setup", "setup-lab", "setup-runtime", "setup-tests") for word in ("-o", target)]
+UNPREPARED = [
+    word for target in ("", "-station", "-lab", "-runtime", "-tests") for word in ("-o", f"setup{target}")
+]  # fmt: skip
 
 
 def programs_said(directory: Path) -> list[list[str]]:
@@ -195,18 +197,18 @@ def test_an_environment_that_cannot_be_made_leaves_the_last_one(tmp_path: Path, 
     for directory in (last, programs):
         directory.mkdir(parents=True)
     (last / "marker").touch()
-    (last / ".complete").touch()
-    os.utime(last / ".complete", (0, 0))  # older than the locks
+    (last / ".build").touch()
+    os.utime(last / ".build", (0, 0))  # older than the locks
     half = f'#!/bin/sh\ncase $1 in -m) ;; *) exec {sys.executable} "$@" ;; esac\nmkdir {last}\n'
     (programs / "python3").write_text(half + ("kill -INT $PPID" if interrupted else "exit 1"))
     (programs / "python3").chmod(0o755)
     done = subprocess.run(
-        ["make", "-C", str(paths.PROJECT), f"BUILD={tmp_path / 'build'}", f"{last}/.complete"],
+        ["make", "-C", str(paths.PROJECT), f"BUILD={tmp_path / 'build'}", f"{last}/.build"],
         env=os.environ | {"PATH": f"{programs}:{os.environ['PATH']}"}, capture_output=True, text=True, timeout=60,
         check=False,
     )  # fmt: skip
     assert done.returncode != 0
-    assert sorted(path.name for path in last.iterdir()) == [".complete", "marker"], done.stderr
+    assert sorted(path.name for path in last.iterdir()) == [".build", "marker"], done.stderr
     assert not last.with_name("venv.before").exists()
 
 
@@ -222,7 +224,7 @@ def test_commands_run_in_utf_8_whatever_the_users_locale_is() -> None:
 
 def checkout(directory: Path) -> Path:
     """What `make setup` reads, with an environment that was made there by a Python that is still there."""
-    for name in ("Makefile", "images", "pyproject.toml", "requirements.lock", "requirements-source.lock"):
+    for name in ("Makefile", "images", "pyproject.toml", "requirements"):
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         (directory / name).symlink_to(paths.PROJECT / name)
     programs = directory / "build" / "venv" / "bin"
@@ -233,7 +235,7 @@ def checkout(directory: Path) -> Path:
     (programs.parent / "pyvenv.cfg").write_text(f"command = {real} -m venv {programs.parent}\n")
     (programs / "pip").write_text("#!/bin/sh\nexit 0\n")
     (programs / "pip").chmod(0o755)
-    (programs.parent / ".complete").touch()
+    (programs.parent / ".build").touch()
     (programs.parent / ".installed").write_text(f"{directory}\n")
     return directory
 
@@ -312,7 +314,7 @@ def test_an_old_python_is_refused_before_anything_is_installed(tmp_path: Path, v
     old.write_text(f"#!/bin/sh\necho {version}\nexit 1\n")
     old.chmod(0o755)
     directory = checkout(tmp_path / "first")
-    (directory / "build/venv/.complete").unlink()
+    (directory / "build/venv/.build").unlink()
     done = setup(directory, PYTHON3=str(old))
     assert done.returncode == 2
     assert done.stderr.splitlines()[0] == (
@@ -324,7 +326,7 @@ def test_an_old_python_is_refused_before_anything_is_installed(tmp_path: Path, v
 def test_a_second_make_waits_for_the_first_and_does_nothing_again(tmp_path: Path) -> None:
     """Seen to fail: both removed the environment that the other was making."""
     directory = checkout(tmp_path)
-    complete = directory / "build/venv/.complete"
+    complete = directory / "build/venv/.build"
     os.utime(complete, (0, 0))  # older than the locks
     with (directory / "build/.venv.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -339,6 +341,81 @@ def test_a_second_make_waits_for_the_first_and_does_nothing_again(tmp_path: Path
             finally:
                 fcntl.flock(lock, fcntl.LOCK_UN)
     assert (second.returncode, said) == (0, "")
+
+
+UV = """#!/bin/sh
+echo "$*" >>{log}
+rm -f {package} && echo new >{package}
+{end}
+"""
+
+
+def with_groups(directory: Path, *groups: str, end: str = "exit 0") -> Path:
+    """A checkout with these groups installed, and a uv that notes what it is given and replaces a package."""
+    venv = checkout(directory) / "build/venv"
+    package = venv / "package"
+    package.write_text("old\n")
+    (venv / "bin/python").symlink_to("python3")
+    (venv / "bin/uv").write_text(UV.format(log=directory / "uv.log", package=package, end=end))
+    (venv / "bin/uv").chmod(0o755)
+    for group in groups:
+        (venv / f".{group}").touch()
+    return venv
+
+
+def installs(directory: Path) -> list[list[str]]:
+    """Of each call of uv: the locks, and `--exact` where it removes what they do not name."""
+    log = directory / "uv.log"
+    lines = [line.split() for line in log.read_text().splitlines()] if log.exists() else []
+    return [[word for word in line if word.endswith(".lock") or word == "--exact"] for line in lines]
+
+
+def locks(*names: str) -> list[str]:
+    return [f"requirements/{name}.lock" for name in names]
+
+
+def test_a_group_is_added_to_what_is_there(tmp_path: Path) -> None:
+    """Seen to fail: every command installed all packages."""
+    venv = with_groups(tmp_path, "build")
+    assert setup(tmp_path).returncode == 0
+    assert installs(tmp_path) == []
+    for _ in range(2):
+        assert setup(tmp_path, "setup-station").returncode == 0
+        assert installs(tmp_path) == [locks("build", "station")]
+        assert (venv / ".station").exists()
+        assert not (venv / ".tests").exists()
+    assert setup(tmp_path, "build/venv/.tests").returncode == 0
+    assert installs(tmp_path)[1:] == [locks("build", "station", "tests"), locks("tests-source")]
+    assert not venv.with_name("venv.before").exists()
+
+
+@pytest.mark.parametrize(("changed", "noticed"), [("build", True), ("station", False), ("tests", False)])
+def test_a_group_is_installed_anew_when_its_lock_changes(tmp_path: Path, changed: str, noticed: bool) -> None:
+    """By the commands that need it: `make image` does not wait for another browser's driver."""
+    venv = with_groups(tmp_path, "build", "station", "tests")
+    os.utime(venv / f".{changed}", (0, 0))
+    assert setup(tmp_path).returncode == 0
+    all_locks = [["--exact", *locks("build", "station", "tests")], locks("tests-source")]
+    assert installs(tmp_path) == (all_locks if noticed else [])
+    for _ in range(2):
+        assert setup(tmp_path, "build/venv/.tests").returncode == 0
+        assert installs(tmp_path) == all_locks
+
+
+@pytest.mark.parametrize("end", ["exit 1", "kill -INT 0"])
+def test_a_group_that_cannot_be_added_leaves_all_as_it_was(tmp_path: Path, end: str) -> None:
+    venv = with_groups(tmp_path, "build", end=end)
+    before = {path.relative_to(venv) for path in venv.rglob("*")}
+    inherited = {name: value for name, value in os.environ.items() if name not in ("BUILD", "PYTHON3")}
+    done = subprocess.run(
+        ["make", "-C", str(tmp_path), "setup-station"], env=inherited, capture_output=True, text=True, timeout=60,
+        check=False, start_new_session=True,
+    )  # fmt: skip
+    assert done.returncode != 0
+    assert installs(tmp_path) == [locks("build", "station")]
+    assert (venv / "package").read_text() == "old\n"
+    assert {path.relative_to(venv) for path in venv.rglob("*")} == before
+    assert not venv.with_name("venv.before").exists()
 
 
 def test_a_checkout_with_the_line_ends_of_windows_is_refused(tmp_path: Path) -> None:
