@@ -79,6 +79,12 @@ int fl_end(struct fl_block *block, const char *format, ...)
     return FL_FAILED;
 }
 
+void fl_not_safe(struct fl_block *block, const char *reason)
+{
+    const char *none = NULL;
+    atomic_compare_exchange_strong(&block->service->not_safe, &none, reason);
+}
+
 bool fl_wired(const struct fl_block *block, uint32_t input)
 {
     return block->service->wired[input];

@@ -4,6 +4,7 @@
 
 #include <flotilla/block.h>
 #include <pthread.h>
+#include <stdatomic.h>
 
 enum {
     FL_FAILURE_BYTES = 256,
@@ -17,12 +18,15 @@ struct fl_memory {
 struct fl_service {
     struct fl_memory *memory;
     char failure[FL_FAILURE_BYTES];
-    bool ended;      /* by fl_end() */
-    bool *wired;     /* which inputs are */
-    bool *given;     /* which parameters the task file sets */
-    int priority;    /* SCHED_FIFO of the block's threads; 0: ordinary */
-    int patience_ms; /* how long to wait for a device that another process holds */
-    int claim_fd;    /* holds the block's device (device.h); below 1: none */
+    bool ended; /* by fl_end() */
+    /* What is known of an actuator's outputs at the end; several threads may make them safe. */
+    _Atomic(const char *) not_safe; /* why they may not be in their reset state; NULL: no reason is known */
+    atomic_bool made_safe;          /* `safe` has returned */
+    bool *wired;                    /* which inputs are */
+    bool *given;                    /* which parameters the task file sets */
+    int priority;                   /* SCHED_FIFO of the block's threads; 0: ordinary */
+    int patience_ms;                /* how long to wait for a device that another process holds */
+    int claim_fd;                   /* holds the block's device (device.h); below 1: none */
     struct fl_port *in_ports, *out_ports;
     size_t near_used; /* of the bytes beside the block */
 

@@ -67,12 +67,14 @@ static bool start_blocks(struct task *task, struct run_result *result)
         struct task_block *task_block = &task->blocks[i];
         if (device_claim(task_block->block) != FL_OK) {
             end(result, ENDING_FAILED, task_block->block, task_block->block->service->failure);
+            task_block->failed = true;
             return false;
         }
         safety_running = task_block->block;
         task_block->started = true; /* terminate also cleans up after a start that failed halfway */
         if (task_block->block->type->start && task_block->block->type->start(task_block->block) != FL_OK) {
             end(result, ENDING_FAILED, task_block->block, task_block->block->service->failure);
+            task_block->failed = true;
             return false;
         }
     }
@@ -91,8 +93,7 @@ static bool start_blocks(struct task *task, struct run_result *result)
 static void make_outputs_safe(struct task *task)
 {
     for (size_t i = task->count; i-- > 0;)
-        if (task->blocks[i].started && task->blocks[i].block->type->safe)
-            task->blocks[i].block->type->safe(task->blocks[i].block);
+        safety_reset(&task->blocks[i]);
 }
 
 static void terminate_blocks(struct task *task)
@@ -106,9 +107,9 @@ static void terminate_blocks(struct task *task)
     }
 }
 
-unsigned executive_make_safe(struct task *task)
+bool executive_make_safe(struct task *task)
 {
-    unsigned failures = 0;
+    char text[SAFETY_OUTCOME];
     for (size_t i = 0; i < task->count; i++) {
         struct task_block *task_block = &task->blocks[i];
         const struct fl_block_type *type = task_block->block->type;
@@ -121,17 +122,17 @@ unsigned executive_make_safe(struct task *task)
         task_block->started = true;
         task_block->failed = type->start && type->start(task_block->block) != FL_OK;
         if (!task_block->failed)
-            type->safe(task_block->block);
+            safety_reset(task_block);
     }
     terminate_blocks(task);
     /* Report only after all outputs are safe: the reader of stderr may be slow. */
-    for (size_t i = 0; i < task->count; i++) {
-        if (!task->blocks[i].failed)
-            continue;
-        fprintf(stderr, "%s: %s\n", task->blocks[i].block->name, task->blocks[i].block->service->failure);
-        failures++;
-    }
-    return failures;
+    for (size_t i = 0; i < task->count; i++)
+        if (task->blocks[i].failed)
+            fprintf(stderr, "%s: %s\n", task->blocks[i].block->name, task->blocks[i].block->service->failure);
+    bool safe = safety_outcome(task, text, sizeof text);
+    if (!safe)
+        fprintf(stderr, "flotilla: %s: %s\n", task->name, text);
+    return safe;
 }
 
 /* --- control thread --- */
@@ -312,8 +313,7 @@ static void *control(void *argument)
 static _Noreturn void abandon(const struct executive *executive, int64_t silent_ns)
 {
     char text[512];
-    snprintf(text, sizeof text,
-             "flotilla: %s: no step ended for %.3f s, after step %" PRIu64 "; outputs are in their reset state\n",
+    snprintf(text, sizeof text, "flotilla: %s: no step ended for %.3f s, after step %" PRIu64 "; ",
              executive->task->name, (double)silent_ns / 1e9, status_steps(executive->status));
     safety_abandon(text);
 }
@@ -499,11 +499,15 @@ static void *run(void *argument)
         service->overran = rate_overran;
         service->overran_context = executive;
     }
-    if ((options->no_wait || take_processor(task, result)) && start_blocks(task, result)) {
+    bool started = (options->no_wait || take_processor(task, result)) && start_blocks(task, result);
+    if (!started)
+        make_outputs_safe(task);
+    if (started) {
         executive->status = status_create(task);
         int error = start_threads(executive, priority, &guarding);
         if (error) {
             end(result, ENDING_FAILED, NULL, strerror(error));
+            make_outputs_safe(task);
         } else {
             serve_parameters(executive);
             sd_notify(0, "READY=1");
@@ -518,6 +522,7 @@ static void *run(void *argument)
     }
     end_as_asked(executive);
     terminate_blocks(task);
+    result->safe = safety_outcome(task, result->outputs, sizeof result->outputs);
     safety_end();
     schedule_report(executive->schedule, task);
     schedule_destroy(executive->schedule);

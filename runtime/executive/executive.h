@@ -17,8 +17,8 @@
 void executive_run(struct task *task, const struct run_options *options, struct run_result *result);
 
 /* Bring all outputs to their reset state without a step, after a task was killed. A device that another process still
- * holds after a second is left as it is. Returns the number of failures. */
-unsigned executive_make_safe(struct task *task);
+ * holds after a second is left as it is. Whether all are in it; otherwise stderr has which are not, and why. */
+bool executive_make_safe(struct task *task);
 
 /* Steps, overruns and times of task and blocks as JSON. `last_overrun` is null where there was none; its `step` ended
  * at `at_ns` of CLOCK_MONOTONIC, `late_ns` after the next one was due. */

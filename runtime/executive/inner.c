@@ -40,8 +40,12 @@ int fl_inner_result(const struct fl_block *outer)
 void fl_inner_safe(const struct fl_block *outer)
 {
     for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next)
-        if (inner->started && inner->block->type->safe)
+        if (inner->started && inner->block->type->safe) {
             inner->block->type->safe(inner->block);
+            const char *reason = atomic_load(&inner->block->service->not_safe);
+            if (reason)
+                fl_not_safe(inner->outer, reason);
+        }
 }
 
 /* Keep the first failure only. */

@@ -107,8 +107,8 @@ int fl_rates_start(struct fl_block *block, const struct fl_rate *rates, uint32_t
 static _Noreturn void abandon(const struct rate *rate, const char *where, int64_t since_ns)
 {
     char text[FL_FAILURE_BYTES];
-    snprintf(text, sizeof text, "flotilla: %s: %s %s, %.3f s after its release; outputs are in their reset state\n",
-             rate->block->name, rate->rate->name, where, (double)since_ns / 1e9);
+    snprintf(text, sizeof text, "flotilla: %s: %s %s, %.3f s after its release; ", rate->block->name, rate->rate->name,
+             where, (double)since_ns / 1e9);
     safety_abandon(text);
 }
 

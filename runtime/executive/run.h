@@ -34,6 +34,8 @@ struct run_options {
 struct run_result {
     enum ending ending;
     char reason[320];
+    bool safe;          /* all outputs are in their reset state */
+    char outputs[1024]; /* which are, and which are not and why */
     uint64_t steps, overruns;
     uint64_t skipped; /* releases without a step */
     struct overrun_of_step {

@@ -1,9 +1,12 @@
 #define _GNU_SOURCE
 #include "safety.h"
 
+#include "core/service.h"
+
 #include <dlfcn.h>
 #include <errno.h>
 #include <inttypes.h>
+#include <poll.h>
 #include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -71,9 +74,91 @@ static void stop_outputs(void)
     while (atomic_load(&safety.left)) {
         const struct task_block *task_block = &task->blocks[atomic_fetch_sub(&safety.left, 1) - 1];
         safety_running = task_block->block;
-        if (task_block->started && task_block->block->type->safe)
-            task_block->block->type->safe(task_block->block);
+        safety_reset(task_block);
     }
+}
+
+void safety_reset(const struct task_block *task_block)
+{
+    if (!task_block->started || !task_block->block->type->safe)
+        return;
+    task_block->block->type->safe(task_block->block);
+    atomic_store(&task_block->block->service->made_safe, true);
+}
+
+/* Why an actuator's outputs may not be in their reset state; NULL: they are. */
+static const char *why_not(const struct task_block *task_block)
+{
+    const struct fl_service *service = task_block->block->service;
+    const char *reason = atomic_load(&service->not_safe);
+    if (reason)
+        return reason;
+    if (task_block->failed)
+        return "its start failed";
+    if (atomic_load(&service->made_safe))
+        return NULL;
+    return task_block->started ? "its reset did not end" : "it was not started";
+}
+
+static void append(char **out, size_t *left, const char *text)
+{
+    for (; *text && *left > 1; (*left)--)
+        *(*out)++ = *text++;
+    **out = '\0';
+}
+
+bool safety_outcome(const struct task *task, char *out, size_t size)
+{
+    size_t actuators = 0, right = 0;
+    append(&out, &size, "");
+    for (size_t i = 0; i < task->count; i++) {
+        if (!task->blocks[i].block->type->safe)
+            continue;
+        actuators++;
+        right += !why_not(&task->blocks[i]);
+    }
+    if (right == actuators) {
+        append(&out, &size, actuators ? "outputs are in their reset state" : "the task has no actuators");
+        return true;
+    }
+    for (size_t i = 0, said = 0; right && i < task->count; i++) {
+        if (!task->blocks[i].block->type->safe || why_not(&task->blocks[i]))
+            continue;
+        append(&out, &size, said++ ? ", " : "outputs of ");
+        append(&out, &size, task->blocks[i].block->name);
+    }
+    append(&out, &size, right ? " are in their reset state, but " : "");
+    for (size_t i = 0, said = 0; i < task->count; i++) {
+        const char *reason = task->blocks[i].block->type->safe ? why_not(&task->blocks[i]) : NULL;
+        if (!reason)
+            continue;
+        append(&out, &size, said++ ? ", " : "OUTPUTS MAY NOT BE IN THEIR RESET STATE: ");
+        append(&out, &size, task->blocks[i].block->name);
+        append(&out, &size, " (");
+        append(&out, &size, reason);
+        append(&out, &size, ")");
+    }
+    return false;
+}
+
+/* What stderr does not accept at once is lost. */
+static void say(const char *text)
+{
+    struct pollfd room = {.fd = STDERR_FILENO, .events = POLLOUT};
+    if (poll(&room, 1, 0) > 0 && write(STDERR_FILENO, text, strlen(text)) < 0)
+        return;
+}
+
+/* Write the state of the outputs. Whether it is as it should be. */
+static bool say_outcome(const char *before)
+{
+    char text[SAFETY_OUTCOME];
+    const struct task *task = atomic_load(&safety.task);
+    bool safe = !task || safety_outcome(task, text, sizeof text);
+    say(before);
+    say(task ? text : "no task runs");
+    say("\n");
+    return safe;
 }
 
 /* Write what crashed: the first time, because what follows may be a crash of this. dladdr and snprintf are not in
@@ -104,8 +189,9 @@ static void report_crash(int number, const siginfo_t *info, const struct fl_bloc
 static void handle(int number, siginfo_t *info, void *context)
 {
     const struct fl_block *running = safety_running;
-    if (number == OWN_SIGNAL && info->si_code == SI_TIMER)
-        _exit(1);
+    if (number == OWN_SIGNAL && info->si_code == SI_TIMER) {
+        _exit(say_outcome("flotilla: the end took too long; ") ? 1 : SAFETY_UNKNOWN);
+    }
     if (number == OWN_SIGNAL && info->si_code == SI_TKILL && gettid() == atomic_load(&safety.stepping)) {
         atomic_store(&safety.parked, true);
         for (;;)
@@ -113,6 +199,10 @@ static void handle(int number, siginfo_t *info, void *context)
     }
     stop_outputs();
     report_crash(number, info, running, (uintptr_t)((ucontext_t *)context)->uc_mcontext.gregs[PROGRAM_COUNTER]);
+    const struct task *task = atomic_load(&safety.task);
+    char text[SAFETY_OUTCOME];
+    if (task && getpid() == safety.process && !safety_outcome(task, text, sizeof text))
+        say_outcome("flotilla: ");
     /* The status, and the core if there is one, say what it died of. */
     signal(number, SIG_DFL);
     raise(number);
@@ -121,15 +211,13 @@ static void handle(int number, siginfo_t *info, void *context)
 void safety_abandon(const char *text)
 {
     stop_outputs();
-    if (write(STDERR_FILENO, text, strlen(text)) < 0)
-        _exit(1);
-    _exit(1);
+    _exit(say_outcome(text) ? 1 : SAFETY_UNKNOWN);
 }
 
 static void at_exit(void)
 {
     if (atomic_load(&safety.task) && getpid() == safety.process)
-        safety_abandon("flotilla: a block has called exit(); outputs are in their reset state\n");
+        safety_abandon("flotilla: a block has called exit(); ");
 }
 
 /* --- not in signal handlers --- */

@@ -31,8 +31,17 @@ extern _Thread_local const struct fl_block *safety_running;
 void safety_step_begin(void);
 void safety_step_end(void);
 
-/* Make outputs safe, write `text` to stderr and end the process with status 1. None of this can block: text that stderr
- * does not accept is lost. From any thread. */
+/* Call `safe` of a block that has started and has one. */
+void safety_reset(const struct task_block *task_block);
+
+/* Whether the outputs of all actuators are in their reset state, as far as is known; writes for the user which are, and
+ * which are not and why. In signal handlers, too. */
+bool safety_outcome(const struct task *task, char *out, size_t size);
+
+enum { SAFETY_OUTCOME = 1024, SAFETY_UNKNOWN = 4 /* status of a process that leaves an output in another state */ };
+
+/* Make outputs safe, write `text` and their state to stderr, and end the process with status 1 or SAFETY_UNKNOWN. None
+ * of this can block: text that stderr does not accept is lost. From any thread. */
 _Noreturn void safety_abandon(const char *text);
 
 /* All signals that would end or stop the process and can wait for an orderly end of the task: all but the fatal ones,

@@ -2,6 +2,7 @@
 #define _GNU_SOURCE
 #include "executive/executive.h"
 #include "executive/instance.h"
+#include "executive/safety.h"
 #include "executive/tuner.h"
 
 #include <errno.h>
@@ -30,8 +31,8 @@ static const char usage[] =
     "  --keys              list the keys of task files, as JSON\n"
     "  --help, --version\n"
     "\n"
-    "Status: 0 ended as asked, 1 the task failed (outputs are in their reset state), 2 the command line or the task\n"
-    "file is wrong, 3 it runs already.\n";
+    "Status: 0 ended as asked, 1 the task failed, 2 the command line or the task file is wrong, 3 it runs already,\n"
+    "4 outputs may not be in their reset state, however the task ended.\n";
 
 enum { CHECK = 1, DOT, SAFE, STEPS, NO_WAIT, WATCH, STATISTICS, CONTROL, BLOCKS, KEYS, HELP, VERSION };
 
@@ -174,8 +175,10 @@ static int run(struct command *command, struct task *task)
     executive_run(task, &command->run, &result);
     tuner_destroy(command->run.tuner);
     bool written = !command->statistics || write_statistics(command->statistics, task, &result);
-    if (result.ending != ENDING_ASKED)
-        fprintf(stderr, "flotilla: %s: %s; outputs are in their reset state\n", task->name, result.reason);
+    if (result.ending != ENDING_ASKED || !result.safe)
+        fprintf(stderr, "flotilla: %s: %s; %s\n", task->name, result.reason, result.outputs);
+    if (!result.safe)
+        return SAFETY_UNKNOWN;
     return (result.ending == ENDING_ASKED || result.ending == ENDING_DONE) && written ? 0 : 1;
 }
 
@@ -196,7 +199,7 @@ int main(int argc, char **argv)
     else if (command.mode == DOT)
         task_write_dot(&task, stdout);
     else if (command.mode == SAFE)
-        status = executive_make_safe(&task) ? 1 : 0;
+        status = executive_make_safe(&task) ? 0 : SAFETY_UNKNOWN;
     else if (command.mode != CHECK)
         status = run(&command, &task);
     free((void *)(uintptr_t)command.run.watched);

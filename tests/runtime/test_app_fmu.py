@@ -249,7 +249,7 @@ def test_a_unit_that_has_come_to_its_end_ends_the_task_in_good_order(flotilla_ru
     task = "period: 10 ms\npriority: 0\nblocks:\n" + STATUS.replace("STATUS", "100")
     run(flotilla_run, build(apps["3"]), task, err=said)
     assert said == [
-        "flotilla: task: unit: the unit has come to its end at 0.01 s, as it asks to; outputs are in their reset state"
+        "flotilla: task: unit: the unit has come to its end at 0.01 s, as it asks to; the task has no actuators"
     ]
 
 

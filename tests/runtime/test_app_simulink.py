@@ -263,7 +263,7 @@ def test_the_models_parameters_tune_its_blocks(flotilla_run: Path, app: Path) ->
 )
 def test_what_fails_in_an_inner_block_ends_the_task(flotilla_run: Path, app: Path, parameters: str, said: str) -> None:
     done = run(flotilla_run, app, parameters=parameters)
-    assert (done.returncode, f"model: {said}" in done.stderr) == (1, True), done.stderr
+    assert (done.returncode, f"model: {said}" in done.stderr) == (4, True), done.stderr
 
 
 def test_a_value_out_of_range_ends_the_task_in_the_step_that_has_it(flotilla_run: Path, app: Path) -> None:
@@ -285,7 +285,7 @@ def test_ports_that_are_others_than_the_codes_end_the_task(flotilla_run: Path, a
     assert text != source.read_text()
     done = run(flotilla_run, app)
     assert "inner constant: its ports are > double[3], and the code was made for > double[4]" in done.stderr
-    assert done.returncode == 1
+    assert done.returncode == 4
 
 
 ACTUATOR_C = """
@@ -351,6 +351,6 @@ def test_an_inner_actuator_fails_and_is_reset_with_the_task(flotilla_run: Path, 
     assert (safe.returncode, safe.stderr) == (0, "valve closed\nvalve left\n")
     file.write_text(TASK.format(parameters="AntiWindup: [1, 2, 3, 4, 5, 6, 7, 8]"))
     broken = subprocess.run([*argv, "--safe"], capture_output=True, text=True, timeout=60, check=False)
-    assert broken.returncode == 1
+    assert broken.returncode == 4
     said = "valve closed\nvalve left\nmodel: inner pid: parameters: "
     assert broken.stderr.startswith(said), "another block stops the reset"

@@ -49,9 +49,14 @@ def test_what_a_block_does_wrong_ends_with_outputs_reset(tasks: Tasks, tmp_path:
     device = tmp_path / "device"
     text = task(TRACE.format(file=device) + f"bad: {{type: misbehave, parameters: {{{bad.manner}}}}}", bad.head)
     ended = tasks.run(text)
-    assert ended.status == 1
     assert bad.said in ended.err
-    assert "outputs are in their reset state" in ended.err
+    if "start" in bad.manner:
+        assert ended.status == 4
+        assert "outputs of out are in their reset state, but OUTPUTS MAY NOT BE" in ended.err
+        assert "IN THEIR RESET STATE: bad (its start failed)\n" in ended.err
+    else:
+        assert ended.status == 1
+        assert "outputs are in their reset state\n" in ended.err
     words = device.read_text().split()
     assert words.count("on") == (0 if "start" in bad.manner else words.index("safe"))
     assert words[-1] == ("safe" if "hang" in bad.manner else "terminated")
@@ -149,7 +154,7 @@ def test_a_reader_that_is_gone_ends_it_with_outputs_reset(tasks: Tasks, tmp_path
 
 CRASHES = {
     "fault": -signal.SIGSEGV, "abort": -signal.SIGABRT, "exit": 1, "overflow": -signal.SIGSEGV,
-    "thread-fault": -signal.SIGSEGV, "thread-exit": 1, "safe-fault": -signal.SIGSEGV, "safe-hang": 1,
+    "thread-fault": -signal.SIGSEGV, "thread-exit": 1, "safe-fault": -signal.SIGSEGV, "safe-hang": 4,
 }  # fmt: skip
 
 
@@ -171,6 +176,40 @@ def test_a_block_that_ends_the_process_leaves_outputs_reset(
     said = re.search(rf"^flotilla: {who}: {crash} at address 0x\w+, in (\S+)\+0x[0-9a-f]+", ended.err, re.M)
     assert bool(said) == (status < 0), ended.err
     assert not said or said[1] == ("misbehave.so" if crash == "SIGSEGV" else "libc.so.6")
+
+
+@pytest.mark.parametrize(("manner", "ends"), [("safe-not", False), ("safe-not, from: 1000000000", True)])
+def test_outputs_that_could_not_be_reset_are_said(tasks: Tasks, tmp_path: Path, manner: str, ends: bool) -> None:
+    """Also where the task ends as it was asked to. Seen to fail: "outputs are in their reset state", status 1 and 0."""
+    bad = f"bad: {{type: misbehave, parameters: {{manner: {manner}}}}}\n"
+    ended = tasks.run(task(TRACE.format(file=tmp_path / "device") + bad, PATIENT), "--steps", "10")
+    assert ended.status == 4
+    assert ended.err.endswith(
+        "outputs of out are in their reset state, but OUTPUTS MAY NOT BE IN THEIR RESET STATE: bad (the bus is down)\n"
+    )
+    assert ("all steps are done" in ended.err) == ends
+
+
+def test_an_actuator_that_another_task_has_is_not_said_to_be_reset(tasks: Tasks, tmp_path: Path) -> None:
+    """Seen to fail: "outputs are in their reset state" while the other task went on to drive them."""
+    first = tasks.argv(task(TRACE.format(file=tmp_path / "device") + "a: {type: gain, in: {in: 1}}", PATIENT))
+    with subprocess.Popen([*first, "--watch", "a.out"], stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout
+            assert process.stdout.readline()
+            other = tmp_path / "other"
+            other.mkdir()
+            later = "later: {{type: trace, parameters: {{device: {file}}}}}\n".format(file=tmp_path / "free")
+            text = task(TRACE.format(file=tmp_path / "device") + later, PATIENT)
+            for options in ((), ("--safe",)):
+                ended = Tasks(tasks.program, tasks.plugins, other).run(text, *options)
+                assert ended.status == 4
+                assert "out: device" in ended.err
+                assert "OUTPUTS MAY NOT BE IN THEIR RESET STATE: out (its start failed)" in ended.err
+                assert ("later (it was not started)" in ended.err) == (not options)
+        finally:
+            process.kill()
+    assert "safe" not in (tmp_path / "device").read_text().split()
 
 
 def test_no_step_follows_when_a_late_one_was_given_up(tasks: Tasks, tmp_path: Path) -> None:
@@ -302,7 +341,7 @@ def test_one_task_moves_an_actuator(
     for path in (device, tmp_path / "other" / "link"):
         for options in ([], ["--safe"]):
             ended = other.run(task(TRACE.format(file=path)), *options)
-            assert ended.status == 1
+            assert ended.status == 4
             assert f'device "{path}" is {held}' in ended.err
     assert set(device.read_text().split()) == {"on"}
     first.kill()
@@ -321,4 +360,4 @@ def test_outputs_are_reset_where_nobody_hears_of_a_failure(tasks: Tasks, tmp_pat
     argv = tasks.argv(task(bad + TRACE.format(file=device)), "--safe")
     status = subprocess.run(argv, stderr=broken, timeout=60, check=False).returncode
     os.close(broken)
-    assert (status, device.read_text().split()) == (1, ["safe", "terminated"])
+    assert (status, device.read_text().split()) == (4, ["safe", "terminated"])

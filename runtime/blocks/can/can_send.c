@@ -124,8 +124,8 @@ static int step(struct fl_block *block)
 static void safe(struct fl_block *block)
 {
     struct sent *sent = block->state;
-    if (sent->resets)
-        can_send(&sent->can, &sent->reset);
+    if (sent->resets && (!can_send(&sent->can, &sent->reset) || atomic_load(&sent->can.bus_off)))
+        fl_not_safe(block, "its reset frame could not be sent");
 }
 
 static void terminate(struct fl_block *block)

@@ -263,11 +263,13 @@ static int start(struct fl_block *block)
     return can_start(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS);
 }
 
-static void send_all(struct state *state, const struct can_frame *frames, size_t count)
+/* Whether the bus takes them all. A frame that the queue refuses is not kept: the next step has newer ones. */
+static bool send_all(struct state *state, const struct can_frame *frames, size_t count)
 {
-    /* A frame that the queue refuses is not kept: the next step has newer ones. */
+    bool sent = !atomic_load(&state->can.bus_off);
     for (size_t i = 0; i < count; i++)
-        can_send(&state->can, &frames[i]);
+        sent &= can_send(&state->can, &frames[i]);
+    return sent;
 }
 
 static void show(struct fl_block *block, struct state *state)
@@ -323,7 +325,8 @@ static void safe(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    send_all(state, out, epos2_disable(&state->drive, out));
+    if (!send_all(state, out, epos2_disable(&state->drive, out)))
+        fl_not_safe(block, "the drive could not be reached by the CAN bus");
 }
 
 static void terminate(struct fl_block *block)

@@ -70,6 +70,7 @@ struct state {
     bool permitted;
     uint16_t base;
     uint32_t initial, reset; /* all relays of the board: bit 0 is relay 1 */
+    uint32_t channels;       /* those that are driven */
     uint32_t commanded;
     int64_t commanded_ns; /* when the last command was new */
     uint32_t sequence;
@@ -161,6 +162,7 @@ static int start(struct fl_block *block)
     state->base = bases[ir104->base];
     state->initial = relays_of(ir104, &ir104->initial);
     state->reset = relays_of(ir104, &ir104->reset);
+    state->channels = relays_of(ir104, &(struct fl_doubles){1, (const double[]){1}});
     int error = port_space->permit(state->base, PORTS, true);
     if (error == EPERM)
         return fl_fail(block,
@@ -239,9 +241,14 @@ static void safe(struct fl_block *block)
     if (!state->permitted)
         return;
     /* A thread that was started before `start` may not use the ports, and its failure may be what ends the task. */
-    port_space->permit(state->base, PORTS, true);
+    if (port_space->permit(state->base, PORTS, true)) {
+        fl_not_safe(block, "it may not use the board's ports");
+        return;
+    }
     state->commanded = state->reset;
     write_relays(state, state->reset);
+    if ((read_bits(state, RELAYS_AT) ^ state->reset) & state->channels)
+        fl_not_safe(block, "relays do not read back as they were written");
 }
 
 static void terminate(struct fl_block *block)

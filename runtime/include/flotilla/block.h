@@ -9,8 +9,9 @@
  *   initialize   sets state and outputs for time zero; not timed
  *   step         once each period of the block, in real time: no allocation, no call that may block
  *   await        where the block may be a task's `trigger`: waits, in real time, for the input of the next step
- *   safe         brings an actuator's outputs to their reset state; in real time, at any moment after start, in any
- *                thread, also in a signal handler that interrupts a step: only what signal-safety(7) allows
+ *   safe         brings an actuator's outputs to their reset state, or says by fl_not_safe() that it could not; in real
+ *                time, at any moment after start, in any thread, also in a signal handler that interrupts a step: only
+ *                what signal-safety(7) allows
  *   terminate    outputs to their reset state, devices closed; also after a start that failed halfway
  *
  * configure, start, initialize and step return 0, or FL_FAILED after fl_fail() was given the reason; step also after
@@ -190,6 +191,10 @@ int fl_fail(struct fl_block *block, const char *format, ...) __attribute__((form
 /* End the task in good order, with a reason: outputs go to their reset state, and the task is not started again. For
  * `return fl_end(...)` in a step; it only stores, too. */
 int fl_end(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));
+
+/* From `safe`: the outputs may not be in their reset state, for a reason that is a constant. Whoever ends the task says
+ * it, and its status differs. The first one counts. */
+void fl_not_safe(struct fl_block *block, const char *reason);
 
 /* Write a line to the journal; not in a step. */
 void fl_log(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));

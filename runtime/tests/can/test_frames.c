@@ -1,4 +1,5 @@
 #define _GNU_SOURCE
+#include "core/service.h"
 #include "seccomp.h"
 #include "testbed.h"
 
@@ -326,6 +327,27 @@ static void a_drive_is_begun_anew_with_its_interface(void **state)
     hub_close();
 }
 
+/* Neither reset frame nor drive can be reached while the interface is down, and a send without a reset has none. */
+static void says_what_could_not_be_reset(void **state)
+{
+    (void)state;
+    hub_open();
+    struct fl_block *blocks[] = {testbed_block("can-send", "id", "5", "length", "1", NULL),
+                                 testbed_block("can-send", "id", "5", "length", "1", "reset", "00", NULL),
+                                 testbed_block("epos2", "node", "5", "mode", "velocity", NULL)};
+    for (size_t i = 0; i < 3; i++) {
+        testbed_begin(blocks[i]);
+        hub_link("7 up");
+        blocks[i]->type->safe(blocks[i]);
+        assert_null(blocks[i]->service->not_safe);
+        hub_link("7 down");
+        blocks[i]->type->safe(blocks[i]);
+        assert_int_equal(!blocks[i]->service->not_safe, i == 0);
+        testbed_end(blocks[i]);
+    }
+    hub_close();
+}
+
 static void a_drive_is_disabled_by_safe_and_at_the_end(void **state)
 {
     (void)state;
@@ -439,6 +461,7 @@ int main(void)
         cmocka_unit_test(receives_again_after_unplugging),
         cmocka_unit_test(bus_off_ends_with_the_interface),
         cmocka_unit_test(a_drive_is_begun_anew_with_its_interface),
+        cmocka_unit_test(says_what_could_not_be_reset),
         cmocka_unit_test(a_drive_is_disabled_by_safe_and_at_the_end),
         cmocka_unit_test(one_block_sends_sync),
         cmocka_unit_test(steps_never_block),

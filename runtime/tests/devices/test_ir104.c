@@ -263,6 +263,34 @@ static void is_safe_right_after_start(void **state)
     assert_false(board.permitted);
 }
 
+/* Relay 2 is stuck, relay 9 too but not driven; then the ports are not to be had any more. */
+static void says_what_could_not_be_reset(void **state)
+{
+    (void)state;
+    static const struct {
+        uint8_t stuck[3];
+        int refusal;
+        const char *reason;
+    } cases[] = {{.stuck = {0, 1}},
+                 {.stuck = {2}, .reason = "relays do not read back as they were written"},
+                 {.refusal = EPERM, .reason = "it may not use the board's ports"}};
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
+        struct fl_block *block = testbed_block("ir104-pbf", "channels", "1,2", "reset", "0,1", NULL);
+        testbed_begin(block);
+        memcpy(board.stuck, cases[i].stuck, sizeof board.stuck);
+        board.refusal = cases[i].refusal;
+        block->type->safe(block);
+        const char *reason = block->service->not_safe;
+        if (cases[i].reason)
+            assert_string_equal(reason, cases[i].reason);
+        else
+            assert_null(reason);
+        board.refusal = 0;
+        memset(board.stuck, 0, sizeof board.stuck);
+        testbed_end(block);
+    }
+}
+
 /* Without permission no port may be touched: `reached` checks. */
 static void touches_nothing_without_permission(void **state)
 {
@@ -348,6 +376,7 @@ int main(void)
         cmocka_unit_test_setup(reads_inputs, plug_in),
         cmocka_unit_test_setup(tells_a_mismatch, plug_in),
         cmocka_unit_test_setup(is_safe_right_after_start, plug_in),
+        cmocka_unit_test_setup(says_what_could_not_be_reset, plug_in),
         cmocka_unit_test_setup(touches_nothing_without_permission, plug_in),
         cmocka_unit_test_setup(names_the_missing_privilege, plug_in),
         cmocka_unit_test_setup(refuses, plug_in),

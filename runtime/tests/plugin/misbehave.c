@@ -20,7 +20,7 @@ struct misbehave {
 static const struct fl_parameter misbehave_parameters[] = {
     FL_PARAMETER(struct misbehave, manner,
                  .choices = "fail|hang|late|allocate|start-fail|fault|abort|exit|"
-                            "overflow|thread-fault|thread-exit|safe-fault|safe-hang"),
+                            "overflow|thread-fault|thread-exit|safe-fault|safe-hang|safe-not"),
     FL_PARAMETER(struct misbehave, from, .default_value = "0"),
     FL_PARAMETER(struct misbehave, until, .default_value = "1000000000"),
     FL_PARAMETER(struct misbehave, late_s, .default_value = "0.025"),
@@ -40,6 +40,7 @@ enum {
     THREAD_EXIT,
     SAFE_FAULT, /* a fault in the step, and another in what follows */
     SAFE_HANG,
+    SAFE_NOT, /* and its step fails */
 };
 
 struct misbehaving {
@@ -91,6 +92,8 @@ static void misbehave_safe(struct fl_block *block)
         fault();
     while (parameters->manner == SAFE_HANG)
         pause();
+    if (parameters->manner == SAFE_NOT)
+        fl_not_safe(block, "the bus is down");
 }
 
 static void misbehave_terminate(struct fl_block *block)
@@ -107,6 +110,7 @@ static int misbehave_step(struct fl_block *block)
         return FL_OK;
     switch (parameters->manner) {
     case FAIL:
+    case SAFE_NOT:
         return fl_fail(block, "failed as asked in step %d", (int)block->step);
     case HANG:
         for (;;)
