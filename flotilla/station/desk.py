@@ -484,5 +484,6 @@ def _task(state: State) -> dict[str, Any]:
         "lately": status and status.lately,
         "sensors": status.flags if status else {},
         "refusals": status.refusals if status else "",
+        "waiting": ", ".join(status.waiting) if status else "",
         "period_ms": status and 1000 * status.period_s,
     }

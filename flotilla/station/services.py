@@ -45,6 +45,8 @@ class TaskStatus:
     refused: dict[str, dict[str, int]] = field(default_factory=dict)
     """By block and kind, how many messages it refused since it was started. A robot with an older release does not say
     so."""
+    waiting: list[str] = field(default_factory=list)
+    """Actuators that do not act until a command was off, because the task was started since."""
 
     @property
     def refusals(self) -> str:
@@ -159,6 +161,7 @@ def _status_of(report: dict[str, Any], past: TaskStatus | None) -> TaskStatus:
             block: {kind: int(count) for kind, count in kinds.items()}
             for block, kinds in report.get("refused", {}).items()
         },
+        waiting=[str(block) for block in report.get("waiting", [])],
     )
 
 

@@ -224,6 +224,11 @@ class Top:
             for (robot, task), state in self._states.items()
             if state.status and state.status.refused
         ]
+        notes += [
+            f"{robot}: {task} is stopped since its start, switch off and on: {', '.join(state.status.waiting)}"
+            for (robot, task), state in self._states.items()
+            if state.status and state.status.waiting
+        ]
         for stream in self._known:
             row, count = self._stats[stream.topic].row(now_ns), self._receiver.counts[stream.topic]
             if row.refusals and not _says(self._states.get((stream.robot, stream.task)), row.attempts):

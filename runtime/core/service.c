@@ -85,6 +85,15 @@ void fl_not_safe(struct fl_block *block, const char *reason)
     atomic_compare_exchange_strong(&block->service->not_safe, &none, reason);
 }
 
+bool fl_may_act(struct fl_block *block, bool off)
+{
+    atomic_int *wait = &block->service->wait;
+    if (atomic_load_explicit(wait, memory_order_relaxed) == FL_WAIT_NOT)
+        return true;
+    atomic_store_explicit(wait, off ? FL_WAIT_NOT : FL_WAITS, memory_order_relaxed);
+    return off;
+}
+
 bool fl_wired(const struct fl_block *block, uint32_t input)
 {
     return block->service->wired[input];

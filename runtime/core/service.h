@@ -11,6 +11,9 @@ enum {
     FL_CACHE_LINE = 64, /* bytes; rings keep their two ends on lines of their own */
 };
 
+/* Of an actuator, for a command that is off (fl_may_act). */
+enum fl_wait { FL_WAIT_NOT, FL_WAIT_BEGUN /* it has not asked yet */, FL_WAITS };
+
 struct fl_memory {
     struct fl_memory *next;
 };
@@ -18,7 +21,9 @@ struct fl_memory {
 struct fl_service {
     struct fl_memory *memory;
     char failure[FL_FAILURE_BYTES];
-    bool ended; /* by fl_end() */
+    bool ended;      /* by fl_end() */
+    atomic_int wait; /* enum fl_wait */
+
     /* What is known of an actuator's outputs at the end; several threads may make them safe. */
     _Atomic(const char *) not_safe; /* why they may not be in their reset state; NULL: no reason is known */
     atomic_bool made_safe;          /* `safe` has returned */

@@ -495,6 +495,7 @@ static void *run(void *argument)
         struct fl_service *service = task->blocks[i].block->service;
         service->priority = priority ? priority - 1 : 0;
         service->rates_in_turn = !priority;
+        service->wait = options->service && task->restart == RESTART_WAIT ? FL_WAIT_BEGUN : FL_WAIT_NOT;
         service->overruns = task->overrun == OVERRUN_STOP_SAFE ? 1 : task->overruns;
         service->overran = rate_overran;
         service->overran_context = executive;

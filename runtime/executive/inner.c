@@ -37,6 +37,14 @@ int fl_inner_result(const struct fl_block *outer)
     return outer->service->inner_failed ? FL_FAILED : FL_OK;
 }
 
+bool inner_waits(const struct fl_block *outer)
+{
+    bool waits = atomic_load_explicit(&outer->service->wait, memory_order_relaxed) == FL_WAITS;
+    for (const struct fl_inner *inner = outer->service->inner; inner && !waits; inner = inner->next)
+        waits = inner->block && inner_waits(inner->block);
+    return waits;
+}
+
 void fl_inner_safe(const struct fl_block *outer)
 {
     for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next)
@@ -93,6 +101,7 @@ struct fl_inner *fl_inner_new(const char *type, double period_s)
     inner->block->period_ns = period_ns ? period_ns : beginning->period_ns;
     inner->block->service->priority = service->priority;
     inner->block->service->patience_ms = service->patience_ms;
+    inner->block->service->wait = service->wait;
     inner->next = service->inner;
     service->inner = inner;
     service->destroy_inner = destroy;

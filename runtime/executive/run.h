@@ -28,6 +28,7 @@ struct run_options {
     bool no_wait;                  /* do not wait for releases: count time instead of measuring it */
     const struct watched *watched; /* print them each step as a line of JSON on stdout */
     size_t watched_count;
+    bool service; /* by the service manager: actuators wait for a command that is off, unless the task says otherwise */
     struct tuner *tuner; /* serves while the task runs; NULL: parameters stay as they are */
 };
 

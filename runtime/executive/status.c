@@ -1,5 +1,7 @@
 #include "status.h"
 
+#include "inner.h"
+
 #include <flotilla/sensor.h>
 #include <inttypes.h>
 #include <sched.h>
@@ -179,6 +181,25 @@ static double seconds(int64_t ns)
     return (double)ns / 1e9;
 }
 
+/* The actuators that wait for a command that is off. */
+static void write_waiting(const struct status *status, bool json, FILE *out)
+{
+    bool any = false;
+    for (size_t i = 0; i < status->task->count; i++) {
+        const struct fl_block *block = status->task->blocks[i].block;
+        if (!inner_waits(block))
+            continue;
+        fprintf(out, json ? "%s\"%s\"" : "%s%s",
+                any    ? ", "
+                : json ? ""
+                       : "waiting for a command that is off: ",
+                block->name);
+        any = true;
+    }
+    if (any && !json)
+        fputc('\n', out);
+}
+
 /* The counts that are not 0, those of a block together; what stands around names depends on `json`. */
 static void write_refusals(const struct status *status, const struct reading *reading, bool json, FILE *out)
 {
@@ -220,7 +241,9 @@ static void write_json(const struct status *status, const struct reading *readin
                 reading->sensors[i].flag ? "true" : "false", (double)reading->sensors[i].age);
     fputs("}, \"refused\": {", out);
     write_refusals(status, reading, true, out);
-    fputs("}}\n", out);
+    fputs("}, \"waiting\": [", out);
+    write_waiting(status, true, out);
+    fputs("]}\n", out);
 }
 
 static void write_text(const struct status *status, const struct reading *reading, int64_t now_ns, FILE *out)
@@ -235,6 +258,7 @@ static void write_text(const struct status *status, const struct reading *readin
     for (size_t i = 0; i < status->count; i++)
         fprintf(out, "%s: flag %d, age %.3f s\n", status->sensors[i].name, reading->sensors[i].flag,
                 (double)reading->sensors[i].age);
+    write_waiting(status, false, out);
     write_refusals(status, reading, false, out);
 }
 

@@ -440,6 +440,7 @@ void task_build(struct task *task, struct registry *registry, struct problems *p
     task->phase_ns = file.phase_ns;
     task->overruns = file.overruns;
     task->overrun = file.overrun;
+    task->restart = file.restart;
     task->priority = (int)file.priority;
     task->cpu = (int)file.cpu;
     task->blocks = grown(NULL, sizeof *task->blocks * (file.count + 1));

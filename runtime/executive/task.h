@@ -22,6 +22,7 @@ struct task_block {
 struct task {
     char *name; /* the file's, without directory and suffix */
     int64_t period_ns, phase_ns, overruns;
+    enum restart restart;
     int priority;
     int cpu; /* TASK_ANY_CPU, or the processor of all threads */
     enum overrun overrun;

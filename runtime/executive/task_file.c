@@ -348,6 +348,14 @@ static const struct key task_keys[] = {
      .max = "1000000",
      .default_value = "10",
      .meaning = "this many overruns in a row end the task with outputs in their reset state; 0: never"},
+    {.name = "restart",
+     .value = CHOICE,
+     .offset = offsetof(struct task_file, restart),
+     .choices = "wait|resume",
+     .default_value = "wait",
+     .meaning =
+         "what actuators do after each start of the task's service, also after a crash: wait until a command was "
+         "off, or resume at once, as a flight that goes on"},
     {.name = "blocks",
      .value = MAPPING,
      .then = read_blocks,

@@ -7,6 +7,7 @@
  *     cpu: 1                   # the processor that all threads of the task run on
  *     overrun: skip            # after a step that ends when the next one was already due: skip, catch-up, stop-safe
  *     overruns: 10             # so many overruns in a row lead to the safe state; 0: never
+ *     restart: wait            # actuators after a start of the service: wait until a command was off, or resume
  *     blocks:
  *       gyro:
  *         type: dsp3000
@@ -28,6 +29,7 @@
 #define TASK_ANY_CPU (-1)
 
 enum overrun { OVERRUN_SKIP, OVERRUN_CATCH_UP, OVERRUN_STOP_SAFE }; /* the order of the key's choices */
+enum restart { RESTART_WAIT, RESTART_RESUME };                      /* likewise */
 
 struct block_entry {
     const char *name, *type;
@@ -40,6 +42,7 @@ struct block_entry {
 struct task_file {
     int64_t period_ns, phase_ns, priority, overruns, cpu; /* `cpu`: TASK_ANY_CPU without the key */
     enum overrun overrun;
+    enum restart restart;
     const char *trigger; /* NULL: the clock */
     unsigned trigger_line;
     struct block_entry *blocks; /* in the order of the file */

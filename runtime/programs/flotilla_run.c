@@ -172,6 +172,7 @@ static int run(struct command *command, struct task *task)
         return 3;
     if (!open_control(command, task))
         return 2;
+    command->run.service = getenv("RUNTIME_DIRECTORY") != NULL;
     executive_run(task, &command->run, &result);
     tuner_destroy(command->run.tuner);
     bool written = !command->statistics || write_statistics(command->statistics, task, &result);

@@ -169,6 +169,7 @@ def test_a_program_that_ignores_sigterm_is_ended_and_its_relays_are_reset(bench:
 SPINNING_TASK = """
 period: 10 ms
 priority: 70
+restart: resume
 blocks:
   teeth: {type: spinning}
   relays: {type: ir104-pbf, in: {command: [1, 1], flag: 1}, parameters: {base: 0x300, channels: [1, 2]}}

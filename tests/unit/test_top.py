@@ -182,6 +182,17 @@ def test_what_any_task_refused_is_named() -> None:
     ]
 
 
+def test_an_actuator_that_waits_is_named() -> None:
+    """Each start of a task stops its actuators until somebody switches them off and on."""
+    status = TaskStatus(0.01, 0, 0, {}, waiting=["left", "right"])
+    still = State("running 5 s", True, TaskStatus(0.01, 0, 0, {}))
+    states = {("robot5", "drive"): State("running 5 s", True, status), ("robot5", "perceive"): still}
+    top = Top(Receiver([STREAM]), states, clock=lambda: 0)
+    assert [line.strip() for line in top.end().splitlines() if "stopped" in line] == [
+        "robot5: drive is stopped since its start, switch off and on: left, right"
+    ]
+
+
 @pytest.mark.parametrize(
     ("refused", "said"),
     [

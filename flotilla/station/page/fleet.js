@@ -121,6 +121,8 @@ export class Fleet {
       const reported = own.find((stream) => stream.task === name && state.streams[stream.topic].refusals);
       const refusals = state.tasks[`${robot.name} ${name}`]?.refusals || (reported && state.streams[reported.topic].refusals);
       if (refusals) parts.push([name, `refused ${refusals}`, false]);
+      const waiting = state.tasks[`${robot.name} ${name}`]?.waiting;
+      if (waiting) parts.push([name, `stopped since its start, switch off and on: ${waiting}`, true]);
     }
     for (const stream of own) {
       const attempts = state.streams[stream.topic].attempts;

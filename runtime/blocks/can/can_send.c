@@ -114,6 +114,8 @@ static int step(struct fl_block *block)
     can_receive(&sent->can, &none, &arrived_ns);
     bool fresh = FL_IN(block, AGE, double) <= set->timeout;
     memcpy(sent->frame.data, block->in[DATA], sent->frame.len);
+    bool off = fresh && memcmp(sent->frame.data, sent->reset.data, sent->frame.len) == 0;
+    fresh &= !sent->resets || fl_may_act(block, off);
     bool taken = (fresh || sent->resets) && can_send(&sent->can, fresh ? &sent->frame : &sent->reset);
     sent->count += taken;
     FL_OUT(block, FLAG, bool) = taken && can_connected(&sent->can) && !atomic_load(&sent->can.bus_off);

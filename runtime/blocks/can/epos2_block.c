@@ -98,7 +98,7 @@ static const struct fl_parameter parameters[] = {
                  .summary = "of the search"),
 };
 
-enum { TARGET, ENABLE, COMMAND_AGE };
+enum { TARGET, ENABLE, COMMAND_AGE, COMMAND_FLAG };
 static const struct fl_port inputs[] = {
     {.name = "target", .type = FL_DOUBLE, .width = 1, .summary = "rad, rad/s or A, by `mode`"},
     {.name = "enable", .type = FL_BOOLEAN, .width = 1, .summary = "0: quick stop, then no power on the motor"},
@@ -109,6 +109,12 @@ static const struct fl_port inputs[] = {
      .summary =
          "age of the command, which counts as none beyond `timeout`: the output `age` of its source, or 0 where it "
          "is constant"},
+    {.name = "flag",
+     .type = FL_BOOLEAN,
+     .width = 1,
+     .flags = FL_OPTIONAL,
+     .summary = "1: `enable` is somebody's command; only such a 0 lets the motor begin after a start of the task's "
+                "service. Without a wire each is"},
 };
 
 enum { POSITION, VELOCITY, CURRENT, STATUS, ERROR, ABORT, ENABLED, HOMED, FLAG };
@@ -308,8 +314,9 @@ static int step(struct fl_block *block)
     int64_t arrived_ns;
     for (int i = 0; i < FRAMES && can_receive(&state->can, &frame, &arrived_ns); i++)
         epos2_receive(&state->drive, &frame, arrived_ns);
-    bool fresh = FL_IN(block, COMMAND_AGE, double) <= set->timeout;
-    struct epos2_command command = {.enable = FL_IN(block, ENABLE, uint8_t),
+    bool fresh = FL_IN(block, COMMAND_AGE, double) <= set->timeout, enable = FL_IN(block, ENABLE, uint8_t);
+    bool commanded = fresh && (!fl_wired(block, COMMAND_FLAG) || FL_IN(block, COMMAND_FLAG, bool));
+    struct epos2_command command = {.enable = fl_may_act(block, commanded && !enable) && enable,
                                     .sync = atomic_load(&state->sync.mine),
                                     .target = fresh ? FL_IN(block, TARGET, double) : (double)NAN};
     follow_interface(state);

@@ -8,6 +8,9 @@
  * however it ended. The thread that steps must be the one that started the block, or one begun by it since
  * (ioperm(2)).
  *
+ * After a start of the task's service the relays stay in `reset` until a new command was equal to it, unless the task
+ * says `restart: resume`.
+ *
  * Failure: Once no new command came for `timeout`, counted from the first step on, the relays go to `reset` and
  * `timed_out` is 1, until the next new command. When the task ends, in whatever way, the relays go to `reset` as long
  * as the process can act. `mismatch` is 1 while relays do not read back as written, which the journal says once.
@@ -179,8 +182,8 @@ static int start(struct fl_block *block)
 static int initialize(struct fl_block *block)
 {
     struct state *state = block->state;
-    state->commanded = state->initial;
-    write_relays(state, state->initial);
+    state->commanded = fl_may_act(block, false) ? state->initial : state->reset;
+    write_relays(state, state->commanded);
     return FL_OK;
 }
 
@@ -208,6 +211,9 @@ static void command(struct fl_block *block, struct state *state)
             if (((const bool *)block->in[COMMAND])[i])
                 state->commanded |= UINT32_C(1) << channel(ir104, i);
     }
+    bool waits = ir104->channels.count && !fl_may_act(block, new && state->commanded == state->reset);
+    if (waits)
+        state->commanded = state->reset;
     if (block->release_ns - state->commanded_ns > llround(ir104->timeout * 1e9)) {
         FL_OUT(block, TIMED_OUT, bool) = true;
         state->commanded = state->reset;

@@ -5,6 +5,10 @@
  * A robot has more thrusters than the three that a force and a torque need, so the duties solve a linear programme. It
  * is solved exactly, in a time that depends on the number of thrusters alone: see allocation.h.
  *
+ * What rounding takes or adds, a thruster owes to the next control period: less than a step, or half of `minimum` where
+ * that is more. It opens no valve that the command leaves closed. So the mean over several control periods is what was
+ * commanded, also with `steps: 1`; a period alone may differ, and turn the robot for a command of force.
+ *
  * Equations:
  *   least Σ u_i with Σ u_i·a_i = (force_x, force_y, torque) and 0 ≤ u_i ≤ 1
  *   a_i = force_i·(d_x, d_y, p_x·d_y − p_y·d_x), with position p and unit direction d of thruster i
@@ -12,10 +16,6 @@
  *   on_time_i = u_i·steps + owed_i, rounded to whole steps; below `minimum` it becomes that or, below its half, 0
  *   owed_i = what the rounding took from on_time_i or, negative, added to it, for the next control period
  *   achieved = Σ a_i·on_time_i/control period
- *
- * What a thruster owes is less than a step, or half of `minimum` where that is more; it opens no valve that the command
- * leaves closed. So the mean over several control periods is what was commanded, also with `steps: 1`, and a period
- * alone may differ from it: it may turn the robot for a command of force alone.
  *
  * Failure: A command that is not finite, or beyond 1e30, opens no valve and gives saturated 1 for its control period;
  * after it nothing is owed.

@@ -196,6 +196,12 @@ int fl_end(struct fl_block *block, const char *format, ...) __attribute__((forma
  * it, and its status differs. The first one counts. */
 void fl_not_safe(struct fl_block *block, const char *reason);
 
+/* Whether an actuator may act in this step; otherwise it keeps its reset state. After the start of a service it has to
+ * wait until a command was off, unless the task says `restart: resume`: no motor turns because a process began anew
+ * while somebody still commands it to. `off`: this step's command is good, and is one to rest. From then on it is true.
+ */
+bool fl_may_act(struct fl_block *block, bool off);
+
 /* Write a line to the journal; not in a step. */
 void fl_log(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));
 

@@ -327,6 +327,63 @@ static void a_drive_is_begun_anew_with_its_interface(void **state)
     hub_close();
 }
 
+/* Until the data were those of the reset frame; one without such a frame has no state to wait in. */
+static void waits_for_a_command_that_is_off(void **state)
+{
+    (void)state;
+    struct can_frame frame;
+    hub_open();
+    static const char *const data[] = {"a", "b", "\xFF", "a"}, *const sent[] = {"\xFF", "\xFF", "\xFF", "a"};
+    struct fl_block *block = testbed_block("can-send", "id", "5", "length", "1", "reset", "ff", "timeout", "0.1", NULL);
+    block->service->wait = FL_WAIT_BEGUN;
+    testbed_begin(block);
+    for (size_t i = 0; i < 4; i++) {
+        memcpy(testbed_input(block, "data"), data[i], 1);
+        assert_int_equal(testbed_step(block), FL_OK);
+        assert_true(hub_take(&frame));
+        assert_memory_equal(frame.data, sent[i], 1);
+    }
+    testbed_end(block);
+    while (hub_take(&frame))
+        ;
+    block = testbed_block("can-send", "id", "5", "length", "1", NULL);
+    block->service->wait = FL_WAIT_BEGUN;
+    testbed_begin(block);
+    memcpy(testbed_input(block, "data"), "a", 1);
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_true(hub_take(&frame));
+    assert_memory_equal(frame.data, "a", 1);
+    testbed_end(block);
+    hub_close();
+}
+
+/* A 0 of `enable` counts where it is a command: not where it is old, and with a wire at `flag` not where that is 0. */
+static void a_drive_waits_for_an_enable_of_0(void **state)
+{
+    (void)state;
+    hub_open();
+    static const struct {
+        bool wired, flag, enable;
+        double age;
+        int waits;
+    } cases[] = {{0, 0, 1, 0, FL_WAITS}, {0, 0, 0, 0, FL_WAIT_NOT}, {0, 0, 0, 1, FL_WAITS},
+                 {1, 0, 0, 0, FL_WAITS}, {1, 1, 1, 0, FL_WAITS},    {1, 1, 0, 0, FL_WAIT_NOT}};
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
+        struct fl_block *block = testbed_block("epos2", "node", "5", "mode", "velocity", "timeout", "0.1", NULL);
+        if (cases[i].wired)
+            testbed_wire(block, "flag");
+        block->service->wait = FL_WAIT_BEGUN;
+        testbed_begin(block);
+        SET(block, "flag", bool, cases[i].flag);
+        SET(block, "enable", bool, cases[i].enable);
+        SET(block, "age", double, cases[i].age);
+        assert_int_equal(testbed_step(block), FL_OK);
+        assert_int_equal(block->service->wait, cases[i].waits);
+        testbed_end(block);
+    }
+    hub_close();
+}
+
 /* Neither reset frame nor drive can be reached while the interface is down, and a send without a reset has none. */
 static void says_what_could_not_be_reset(void **state)
 {
@@ -462,6 +519,8 @@ int main(void)
         cmocka_unit_test(bus_off_ends_with_the_interface),
         cmocka_unit_test(a_drive_is_begun_anew_with_its_interface),
         cmocka_unit_test(says_what_could_not_be_reset),
+        cmocka_unit_test(waits_for_a_command_that_is_off),
+        cmocka_unit_test(a_drive_waits_for_an_enable_of_0),
         cmocka_unit_test(a_drive_is_disabled_by_safe_and_at_the_end),
         cmocka_unit_test(one_block_sends_sync),
         cmocka_unit_test(steps_never_block),

@@ -263,6 +263,31 @@ static void is_safe_right_after_start(void **state)
     assert_false(board.permitted);
 }
 
+/* After a start of the service they stay in `reset`, also before the first command, until a command was equal to it. */
+static void waits_for_a_command_that_is_off(void **state)
+{
+    (void)state;
+    static const struct {
+        bool first, second, flag;
+        uint32_t relays;
+    } steps[] = {{1, 0, 1, RELAY(2)}, {0, 1, 0, RELAY(2)}, {1, 1, 1, RELAY(2)},
+                 {0, 1, 1, RELAY(2)}, {1, 0, 1, RELAY(1)}, {1, 1, 1, RELAY(1) | RELAY(2)}};
+    struct fl_block *block = testbed_block("ir104-pbf", "channels", "1,2", "initial", "1,0", "reset", "0,1", NULL);
+    bool *command = testbed_input(block, "command");
+    block->service->wait = FL_WAIT_BEGUN;
+    testbed_begin(block);
+    assert_int_equal(relays(), RELAY(2));
+    for (size_t i = 0; i < sizeof steps / sizeof steps[0]; i++) {
+        command[0] = steps[i].first;
+        command[1] = steps[i].second;
+        SET(block, "flag", bool, steps[i].flag);
+        assert_int_equal(testbed_step(block), FL_OK);
+        assert_int_equal(relays(), steps[i].relays);
+        assert_int_equal(block->service->wait, i < 3 ? FL_WAITS : FL_WAIT_NOT);
+    }
+    testbed_end(block);
+}
+
 /* Relay 2 is stuck, relay 9 too but not driven; then the ports are not to be had any more. */
 static void says_what_could_not_be_reset(void **state)
 {
@@ -377,6 +402,7 @@ int main(void)
         cmocka_unit_test_setup(tells_a_mismatch, plug_in),
         cmocka_unit_test_setup(is_safe_right_after_start, plug_in),
         cmocka_unit_test_setup(says_what_could_not_be_reset, plug_in),
+        cmocka_unit_test_setup(waits_for_a_command_that_is_off, plug_in),
         cmocka_unit_test_setup(touches_nothing_without_permission, plug_in),
         cmocka_unit_test_setup(names_the_missing_privilege, plug_in),
         cmocka_unit_test_setup(refuses, plug_in),
