@@ -316,8 +316,8 @@ positions: | setup-station ## positions of the indoor positioning system to a ro
 fetch: | setup ## recorder files of a robot's task: make fetch ROBOT=3 TASK=heading [OUT=directory]
 	$(Q)$(FLOTILLA) fetch $(call need,ROBOT) $(call need,TASK) $(call option,--out,OUT)
 
-convert: | setup-station ## MCAP, CSV or MAT of files of a recorder: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat
-	$(Q)$(FLOTILLA) convert $(call need,OUT) $(call need_each,FILE)
+convert: | setup-station ## make MCAP, CSV or MAT of recordings: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat [TOPIC=/robot3/control/report]
+	$(Q)$(FLOTILLA) convert $(call option,--topic,TOPIC) $(call need,OUT) $(call need_each,FILE)
 
 report: | setup-station ## a page of recordings: paths, commands, hops, latency: make report FILE=run.mcap|"log-*.rec" [OUT=page.html]
 	$(Q)$(FLOTILLA) report $(call option,--out,OUT) $(call need_each,FILE)

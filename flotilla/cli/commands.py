@@ -559,18 +559,16 @@ def _fetch_arguments(parser: argparse.ArgumentParser) -> None:
 def _convert(arguments: argparse.Namespace) -> None:
     from flotilla.station import convert
 
-    print("\n".join(convert.convert(arguments.files, arguments.out)))
+    print("\n".join(convert.convert(arguments.files, arguments.out, arguments.topic)))
 
 
 def _convert_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="NAME.mcap, NAME.csv or NAME.mat; it must not be there")
-    _recorder_files(parser)
-
-
-def _recorder_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--topic", help="the only one of several; CSV holds one")
     parser.add_argument(
-        "files", type=Path, nargs="+", metavar="FILE", help="of a recorder, NAME-000001.rec, or folders of such"
-    )
+        "files", type=Path, nargs="+", metavar="FILE",
+        help="of a recorder, NAME-000001.rec, or folders of such; or a recording of `make record`",
+    )  # fmt: skip
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -666,7 +664,7 @@ COMMANDS = (
     Command("Robots", "positions", "send the positioning system's positions to a robot, with proof", _positions,
             _positions_arguments, packages="station"),
     Command("Robots", "fetch", "bring a robot's recorder files to this computer", _fetch, _fetch_arguments),
-    Command("Robots", "convert", "make MCAP, CSV or MAT of files of a recorder", _convert, _convert_arguments,
+    Command("Robots", "convert", "make MCAP, CSV or MAT of recordings", _convert, _convert_arguments,
             packages="station"),
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments,
             packages="station"),

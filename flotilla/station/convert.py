@@ -1,4 +1,4 @@
-"""Files of the block `recorder` as one that other programs open: MCAP, CSV or MAT. `make convert`.
+"""Files of the block `recorder`, or topics of an MCAP file, as a file for other programs: `make convert`.
 
 Every form has each record's time of day beside its fields, and in CSV and MAT the seconds since the recording's first
 record. The output is written beside and renamed, and never in the place of a file that is there.
@@ -13,17 +13,18 @@ import itertools
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
 from flotilla.common import durable, paths, progress
 from flotilla.common.errors import UserError
-from flotilla.station import recording, segments
-from flotilla.station.recording import Array
+from flotilla.common.signals import CODES
+from flotilla.station import mcap_reader, recording, segments
+from flotilla.station.recording import Array, Field
 from flotilla.station.schema import ENCODING, Schema, identifiers
-from flotilla.station.segments import Recorded
+from flotilla.station.topic import Topic
 
 SECONDS, WALL = "time_s", "wall_ns"
 """Columns before the record's own: since the recording's first record, and since 1970-01-01 UTC."""
@@ -34,24 +35,47 @@ _MATLAB_KEYWORDS = (
     "otherwise", "parfor", "persistent", "return", "spmd", "switch", "try", "while",
 )  # fmt: skip
 Chunks = Iterator[tuple[Array, Array]]
-Read = Callable[[Recorded], Chunks]
+
+
+class Source(Protocol):
+    """A recording, whoever wrote it."""
+
+    @property
+    def topic(self) -> str: ...
+    @property
+    def fields(self) -> tuple[Field, ...]: ...
+    @property
+    def record_bytes(self) -> int: ...
+    @property
+    def most(self) -> int: ...
+    @property
+    def size(self) -> int: ...
+    def chunks(self) -> Chunks: ...
+    def notes(self) -> list[str]: ...
+    def account(self) -> str: ...
+
+
+Read = Callable[[Source], Chunks]
 """What reads a recording: it shows how far it is."""
 
 
-def convert(given: Sequence[Path], out: Path) -> list[str]:
-    """Write `out`, whose name tells the form; what came of it, a line each. UserError where that cannot be."""
+def convert(given: Sequence[Path], out: Path, topic: str | None = None) -> list[str]:
+    """Write `out`, whose name tells the form; what came of it, a line each. UserError where that cannot be.
+
+    `given`: files of recorders, or one MCAP file, of which `topic` is one.
+    """
     form = _FORMS.get(out.suffix.lower())
     if not form:
         raise UserError(f"OUT={paths.shown(out)}: is no form that is known; let it end in {', '.join(_FORMS)}")
     if out.exists():
         raise UserError(f"{paths.shown(out)} is there already; give another name: OUT=")
-    recorded = segments.find(segments.files(given))
+    recorded = _sources(given, out, topic)
     total = sum(each.size for each in recorded)
     done = 0
     beside = out.with_name(f"{out.name}.part")
     with progress.step(f"conversion to {out.name}") as step:
 
-        def read(one: Recorded) -> Chunks:
+        def read(one: Source) -> Chunks:
             nonlocal done
             for records, times_ns in one.chunks():
                 yield records, times_ns
@@ -69,16 +93,55 @@ def convert(given: Sequence[Path], out: Path) -> list[str]:
                 beside.unlink()
     for each in recorded:
         said += each.notes()
-    return [f"{paths.shown(out)}: {progress.size(out.stat().st_size)}", *(_account(each) for each in recorded), *said]
+    return [f"{paths.shown(out)}: {progress.size(out.stat().st_size)}", *(each.account() for each in recorded), *said]
 
 
-def _account(recorded: Recorded) -> str:
-    count = sum(found.records for found in recorded.found.values())
-    first = recorded.segments[0].first
-    since = first and np.datetime64(first[0] + recorded.walls_ns[0], "ns").astype("datetime64[s]")
-    begin = f" from {since} UTC on" if since is not None else ""
-    files = len(recorded.segments)
-    return f"{recorded.topic}: {count} records of {files} file{'s' * (files > 1)}{begin}"
+def _sources(given: Sequence[Path], out: Path, topic: str | None) -> Sequence[Source]:
+    """What to convert: recordings of recorders, or the topics of one MCAP file."""
+    files = segments.files(given)
+    found: Sequence[Source]
+    if len(files) == 1 and files[0].suffix.lower() == ".mcap":
+        if out.suffix.lower() == ".mcap":
+            raise UserError(f"{paths.shown(files[0])}: is MCAP already; OUT=NAME.csv or NAME.mat")
+        damage = mcap_reader.Damage()
+        topics = mcap_reader.read(files[0], damage)
+        found = [Messages(each, damage.notes(files[0]) if each is topics[0] else []) for each in topics if each.signals]
+    else:
+        found = segments.find(files)
+    if topic is None:
+        return found
+    if not (chosen := [each for each in found if each.topic == topic]):
+        raise UserError(f"TOPIC={topic}: is not there; there are {', '.join(each.topic for each in found)}")
+    return chosen
+
+
+class Messages:
+    """A topic of an MCAP file, as a recording of a recorder is."""
+
+    def __init__(self, topic: Topic, notes: list[str]) -> None:
+        self.topic, self._notes, self._times_ns = topic.name, notes, topic.times_ns
+        kinds = {recording.dtype(name): name for name in CODES}
+        self.fields = tuple(
+            Field(name, kinds[values.dtype.newbyteorder("<")], values.shape[1] if values.ndim > 1 else 1, 0)
+            for name, values in topic.signals.items()
+            if values.dtype.newbyteorder("<") in kinds and values.ndim < 3
+        )
+        kinds_of = [(each.name, recording.dtype(each.type), (each.width,)[: each.width - 1]) for each in self.fields]
+        self._records = np.zeros(len(topic.times_ns), kinds_of)
+        for each in self.fields:
+            self._records[each.name] = topic.signals[each.name].reshape(self._records[each.name].shape)
+        self.most, self.size = len(self._records), self._records.nbytes
+        self.record_bytes = self._records.dtype.itemsize
+
+    def chunks(self) -> Chunks:
+        yield self._records, self._times_ns
+
+    def notes(self) -> list[str]:
+        return self._notes
+
+    def account(self) -> str:
+        since = np.datetime64(int(self._times_ns[0]), "ns").astype("datetime64[s]")
+        return f"{self.topic}: {self.most} messages from {since} UTC on"
 
 
 def _renamed(topic: str, found: Mapping[str, str]) -> list[str]:
@@ -86,7 +149,7 @@ def _renamed(topic: str, found: Mapping[str, str]) -> list[str]:
     return [f"{topic}: {name} is {named} there" for name, named in found.items() if name != named]
 
 
-def _write_mcap(recorded: Sequence[Recorded], out: Path, read: Read) -> list[str]:
+def _write_mcap(recorded: Sequence[Source], out: Path, read: Read) -> list[str]:
     """A topic a recording. Messages of all are in the order of their times, as viewers like them."""
     schemas = [Schema(one.topic, one.topic[1:], one.fields) for one in recorded]
     with out.open("wb") as file:
@@ -106,7 +169,7 @@ def _write_mcap(recorded: Sequence[Recorded], out: Path, read: Read) -> list[str
     return [note for one, schema in zip(recorded, schemas, strict=True) for note in _renamed(one.topic, schema.names)]
 
 
-def _messages(at: int, recorded: Recorded, read: Read) -> Iterator[tuple[int, int, int, dict[str, Any]]]:
+def _messages(at: int, recorded: Source, read: Read) -> Iterator[tuple[int, int, int, dict[str, Any]]]:
     """Each with the number `at` of its recording and its own, which also say which of two at one time is first."""
     numbers = itertools.count()
     names = [field.name for field in recorded.fields]
@@ -116,11 +179,14 @@ def _messages(at: int, recorded: Recorded, read: Read) -> Iterator[tuple[int, in
             yield time_ns, at, next(numbers), dict(zip(names, values, strict=True))
 
 
-def _write_csv(recorded: Sequence[Recorded], out: Path, read: Read) -> list[str]:
+def _write_csv(recorded: Sequence[Source], out: Path, read: Read) -> list[str]:
     """A row a record; a signal of several elements has as many columns. Booleans are 0 and 1."""
     if len(recorded) > 1:
         topics = ", ".join(one.topic for one in recorded)
-        raise UserError(f"{topics}: are {len(recorded)} recordings, and CSV holds one; name its files, or OUT=run.mcap")
+        raise UserError(
+            f"{topics}: are {len(recorded)} recordings, and CSV holds one; say TOPIC={recorded[0].topic}, name "
+            "the files of one, or OUT=run.mat"
+        )
     (one,) = recorded
     begin_ns = None
     with out.open("w", newline="") as file:
@@ -138,7 +204,7 @@ def _write_csv(recorded: Sequence[Recorded], out: Path, read: Read) -> list[str]
     return []
 
 
-def _write_mat(recorded: Sequence[Recorded], out: Path, read: Read) -> list[str]:
+def _write_mat(recorded: Sequence[Source], out: Path, read: Read) -> list[str]:
     """A struct a recording, with a column vector a signal, or a matrix with a row a record."""
     import scipy.io
 
@@ -166,9 +232,9 @@ def _own(name: str) -> str:
     return f"{name}_" if name in (SECONDS, WALL) else name
 
 
-def _columns(recorded: Recorded, read: Read, place: Path) -> dict[str, Array]:
+def _columns(recorded: Source, read: Read, place: Path) -> dict[str, Array]:
     """By name, a row a record, in files that begin with `place`."""
-    most = sum(segment.file.stat().st_size // recorded.record_bytes for segment in recorded.segments)
+    most = recorded.most
     kinds = {SECONDS: (np.dtype("f8"), 1), WALL: (np.dtype("i8"), 1)}
     kinds |= {_own(field.name): (recording.dtype(field.type), field.width) for field in recorded.fields}
     columns: dict[str, Array] = {

@@ -69,6 +69,15 @@ def line(axes: Axes, seconds: Array, values: Array, *, color: str, label: str | 
     )
 
 
+def image(figure: Figure, axes: Axes, seconds: Array, columns: Array, *, label: str) -> None:
+    """Values as colours: time across, elements up. Of many rows, some are shown; what is not finite has no colour."""
+    rows = np.unique(np.linspace(0, len(seconds) - 1, min(len(seconds), _MOST)).astype(int))
+    values = np.ma.masked_invalid(columns[rows].T.astype(float))
+    edges = np.append(seconds[rows], seconds[rows[-1]] + (seconds[-1] - seconds[0]) / max(len(rows) - 1, 1))
+    mesh = axes.pcolormesh(edges, np.arange(columns.shape[1] + 1) - 0.5, values, cmap="viridis", rasterized=True)
+    figure.colorbar(mesh, ax=axes, label=label)
+
+
 def thinned(rows: Array) -> Array:
     """Of these rows, as many as a picture shows, the first and the last among them."""
     found: Array = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), 4 * _MOST)).astype(int))]

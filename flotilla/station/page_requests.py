@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
@@ -138,6 +140,11 @@ _ADAPTER: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discrimina
 class NoRequestError(Exception):
     """What came is none; says why, in a line."""
 
+    def __init__(self, text: str, number: int | None = None) -> None:
+        super().__init__(text)
+        self.number = number
+        """The `id` of the answer that its sender waits for, if it has one."""
+
 
 def read(text: str | bytes) -> Request:
     """What a browser sent."""
@@ -146,6 +153,14 @@ def read(text: str | bytes) -> Request:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise NoRequestError(f"{place}: {first['msg']}" if place else first["msg"]) from error
+        raise NoRequestError(f"{place}: {first['msg']}" if place else first["msg"], _number(text)) from error
     except (ValueError, RecursionError) as error:
         raise NoRequestError(f"{error}"[:200]) from error
+
+
+def _number(text: str | bytes) -> int | None:
+    with contextlib.suppress(ValueError, RecursionError):
+        found = json.loads(text)
+        if isinstance(found, dict) and type(found.get("id")) is int and 0 <= found["id"] < 1 << 31:
+            return int(found["id"])
+    return None

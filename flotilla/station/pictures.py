@@ -7,7 +7,7 @@
 | `..._ns`, moments of one step on its way through tasks | latency of each hop |
 | booleans | when each is 1 |
 | `alive`, `good`, `seeing`, `limited` | shaded in pictures of their topic while they say that something is wrong |
-| all others | against time; elements of one unit share axes |
+| all others | against time; elements of one unit share axes, more than 16 are an image |
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ _STATES = (("alive", False, "#d62728"), ("good", False, "#d62728"), ("seeing", F
            ("limited", True, "#e8a33d"))  # fmt: skip
 """Flags, what they are when something is wrong, and the colour of that time."""
 _ARROWS = 16
+_MOST_LINES = 16
+"""Elements of one unit that are lines. More, such as a scan's ranges, are an image: time across, elements up."""
 _MOST_SPANS = 300
 """That a picture shades: nearer ones become one."""
 
@@ -276,6 +278,10 @@ def _lines(topic: Topic, name: str, seconds: Array, shown: Sequence[State]) -> s
     figure, panels = figures.panels(len(order))
     for axes, unit in zip(panels, order, strict=True):
         own = [at for at, each in enumerate(known) if each == unit]
+        if len(own) > _MOST_LINES:
+            figures.image(figure, axes, seconds, columns[:, own], label=f"{name}, {unit}" if unit else name)
+            axes.set(ylabel="element")
+            continue
         for at, color in zip(own, COLOURS * len(own), strict=False):
             label = f"{name}[{at}]" if columns.shape[1] > 1 else name
             figures.line(axes, seconds, columns[:, at], color=color, label=label)
@@ -285,6 +291,6 @@ def _lines(topic: Topic, name: str, seconds: Array, shown: Sequence[State]) -> s
         _shade(axes, shown)
     panels[0].set(title=f"{topic.name}: {name}")
     panels[-1].set(xlabel="time, s")
-    if columns.shape[1] > 1 or shown:
+    if columns.shape[1] <= _MOST_LINES and (columns.shape[1] > 1 or shown):
         figures.legend_above(panels[0])
     return figures.svg(figure)

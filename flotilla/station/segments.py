@@ -65,6 +65,20 @@ class Recorded:
         return self.segments[0].header.bytes_of_record
 
     @property
+    def most(self) -> int:
+        """Records at most."""
+        return sum(segment.file.stat().st_size // self.record_bytes for segment in self.segments)
+
+    def account(self) -> str:
+        """What was read so far, in a line."""
+        count = sum(found.records for found in self.found.values())
+        first = self.segments[0].first
+        since = first and np.datetime64(first[0] + self.walls_ns[0], "ns").astype("datetime64[s]")
+        begin = f" from {since} UTC on" if since is not None else ""
+        files = len(self.segments)
+        return f"{self.topic}: {count} records of {files} file{'s' * (files > 1)}{begin}"
+
+    @property
     def size(self) -> int:
         """Bytes of its files."""
         return sum(segment.file.stat().st_size for segment in self.segments)

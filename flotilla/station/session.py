@@ -110,6 +110,8 @@ class Session:
             self.garbage += 1
             if self.garbage == 1:
                 self._note(f"{self.operator.name}: no request: {error}")
+            if error.number is not None:  # who asked waits for an answer
+                self.tell({"type": "answer", "id": error.number, "good": False, "text": str(error)})
             return f"{self.garbage} things that are no request" if self.garbage >= GARBAGE else ""
         do(request)
         return ""

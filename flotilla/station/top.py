@@ -99,6 +99,7 @@ class StreamStats:
         self._steps = 1 << 8 * size(scalars["step"]) if "int" in scalars.get("step", "") else 0
         """How many numbers its signal `step` has; 0: there is none."""
         self._every = stream.every
+        self._period_s = 1 / stream.rate_hz
         self._begun_ns = begun_ns
         self._recent: deque[_Came] = deque()
         """At least the last one."""
@@ -131,7 +132,9 @@ class StreamStats:
 
     def row(self, now_ns: int) -> Row:
         recent = [came for came in self._recent if came.received_ns > now_ns - WINDOW_NS]
-        window_ns = min(WINDOW_NS, max(1, now_ns - self._begun_ns))
+        # After a jump of a replay, messages from before it come again: the window begins with the first of them.
+        begun_ns = min([self._begun_ns, *(came.received_ns for came in recent[:1])])
+        window_ns = min(WINDOW_NS, max(round(1e9 * self._period_s), now_ns - begun_ns))
         shown = [came.flags for came in recent or list(self._recent)[-1:]]
         lost = max(0, self._lost - recent[0].lost) if recent else 1
         return Row(

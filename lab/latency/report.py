@@ -134,6 +134,8 @@ def render(runs: Sequence[Results]) -> str:
     environment.filters |= {"zip": zip, "cause": trace.cause}
     return environment.get_template("report.html.j2").render(
         runs=[(label(run), run) for run in runs],
+        virtual=any(run.where == VIRTUAL for run in runs),
+        robots=sorted({run.where for run in runs if run.where != VIRTUAL}),
         charts=charts(runs),
         rows=rows(runs),
         missed=missed(runs),

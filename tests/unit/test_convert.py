@@ -228,7 +228,9 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"run\.csv/a\.mat: .*; make room, or name another place: OUT="):
         convert.convert(made, tmp_path / "run.csv" / "a.mat")
     ring(tmp_path, name="other")
-    with pytest.raises(UserError, match=r"/log, /other: are 2 recordings, and CSV holds one; name its files"):
+    with pytest.raises(
+        UserError, match=r"/log, /other: are 2 recordings, and CSV holds one; say TOPIC=/log, name the files"
+    ):
         convert.convert([tmp_path], tmp_path / "two.csv")
     with pytest.raises(UserError, match=r"x-\*\.rec: matches no file"):
         convert.convert([tmp_path / "x-*.rec"], tmp_path / "two.csv")

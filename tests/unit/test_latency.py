@@ -456,7 +456,14 @@ def test_a_robot_that_missed_periods_is_measured(tmp_path: Path, monkeypatch: py
 
 
 def test_a_robot_is_named_as_such() -> None:
-    assert report.label(made().model_copy(update={"where": "robot3, real time"})) == "robot3, real time"
+    robot = made().model_copy(update={"where": "robot3, real time"})
+    assert report.label(robot) == "robot3, real time"
+    # Seen to fail: a robot's figures were "measured in QEMU's virtual time".
+    page = report.render([robot])
+    assert ("Measured on robot3, real time" in page, "QEMU" in page) == (True, False)
+    both = report.render([robot, made()])
+    assert ("Measured on robot3" in both, "virtual time where no robot is named" in both) == (True, True)
+    assert "Measured on" not in report.render([made()])
     assert report.label(made().model_copy(update={"plan": "quick"})) == "board, debian (quick)"
 
 

@@ -51,7 +51,7 @@ GIVEN = {
     "live": ["OUT", "SECONDS"],
     "top": ["OUT", "PORT"],
     "fetch": ["ROBOT", "TASK", "OUT"],
-    "convert": ["OUT"],
+    "convert": ["OUT", "TOPIC"],
     "report": ["OUT"],
     "param": ["ROBOT", "TASK", "PARAM", "VALUE"],
     "scope": ["ROBOT", "TASK", "EVERY", "ROWS", "TRIGGER", "BEFORE", "CSV"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 from pathlib import Path
@@ -9,13 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
-from flotilla.station import hops, mcap_reader, report
+from flotilla.station import convert, hops, mcap_reader, pictures, report
 from flotilla.station.mcap_reader import Damage
 from flotilla.station.record import Recorder
 from flotilla.station.telemetry import streams
+from flotilla.station.topic import Topic
 from tests.station import FLEET
 
 SECOND_NS = 1_000_000_000
@@ -126,3 +129,38 @@ def test_a_page_that_cannot_be_written_is_named(recording: Path, tmp_path: Path)
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"file/page\.html: .*; name another file: OUT="):
         report.write([recording], tmp_path / "file" / "page.html")
+
+
+def test_a_recording_becomes_csv_and_mat(recording: Path, tmp_path: Path) -> None:
+    """Seen to fail: `no recording: it does not begin as one`."""
+    said = convert.convert([recording], tmp_path / "valves.csv", "/robot1/valves/report")
+    assert any(line.startswith("/robot1/valves/report: 497 messages from 2026-01-01T00:00:00 UTC on") for line in said)
+    with (tmp_path / "valves.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == [step for step in range(STEPS) if step not in LOST]
+    assert [rows[3]["valves[0]"], rows[3]["valves[7]"], rows[3]["time_s"]] == ["0", "0", "0.03"]
+    convert.convert([recording], tmp_path / "all.mat")
+    control = scipy.io.loadmat(tmp_path / "all.mat", simplify_cells=True)["robot3_control_report"]
+    assert control["wanted"].shape == (50, 2)
+    assert control["wanted"][10] == pytest.approx([math.cos(math.tau / 5), math.sin(math.tau / 5)])
+    for out, topic, reason in (
+        ("a.mcap", None, "circle.mcap: is MCAP already; OUT=NAME.csv or NAME.mat"),
+        ("a.csv", None, "recordings, and CSV holds one; say TOPIC=/robot1/valves/report"),
+        ("a.csv", "/robot9/x/y", "TOPIC=/robot9/x/y: is not there; there are /robot1/valves/report"),
+    ):
+        with pytest.raises(UserError, match=re.escape(reason)):
+            convert.convert([recording], tmp_path / out, topic)
+        assert not (tmp_path / out).exists()
+
+
+def test_a_scan_is_an_image_and_no_hundred_lines() -> None:
+    """Seen to fail: 171 lines, whose legend alone was 43 rows."""
+    seconds = np.arange(20)
+    ranges = np.add.outer(seconds, np.linspace(1, 4, 171))
+    ranges[3, 7] = np.nan
+    topic = Topic("/robot1/perceive/scan", BEGIN_NS + SECOND_NS * seconds, {"ranges": ranges}, {"ranges": ("m",)})
+    (picture,) = pictures.of_topic(topic, BEGIN_NS)
+    assert "ranges[" not in picture
+    assert picture.count("<image") >= 1
+    assert "ranges, m" in picture
+    assert picture == next(pictures.of_topic(topic, BEGIN_NS))

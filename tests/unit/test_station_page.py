@@ -68,8 +68,17 @@ def test_a_request_that_is_none(wrong: dict[str, object]) -> None:
 
 @pytest.mark.parametrize("text", ["", "null", "[]", "[" * 4000, '{"do":"drive"', b"\xff\xfe"])
 def test_no_json_of_a_request(text: str | bytes) -> None:
-    with pytest.raises(NoRequestError):
+    with pytest.raises(NoRequestError) as refused:
         page_requests.read(text)
+    assert refused.value.number is None
+
+
+def test_who_waits_for_an_answer_to_what_is_no_request_is_known() -> None:
+    """Seen to fail: a plot with a wrong trigger waited for ever."""
+    watch = {"do": "watch", "id": 7, "robot": "robot1", "task": "drive", "signals": ["a.out"], "trigger": "a.out=3"}
+    with pytest.raises(NoRequestError, match="trigger") as refused:
+        page_requests.read(json.dumps(watch))
+    assert refused.value.number == 7
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,21 @@ def test_a_silent_stream_has_age_and_no_rate() -> None:
     assert StreamStats(STREAM, 0).row(SECOND_NS) == row(0, {}, link=0, age_s=None)
 
 
+def test_the_rate_after_a_jump_of_a_replay_is_that_of_the_messages_before_it() -> None:
+    """Seen to fail with 20000000000.0 of 10 Hz: the window began at the jump."""
+    step_ns = round(SECOND_NS / STREAM.rate_hz)
+    jumped_ns = 1000 * SECOND_NS
+    found = StreamStats(STREAM, jumped_ns)
+    for step in range(20):
+        found.take(
+            {"good": True, "valves": (True,) * 8, "flying": True, "step": 500 + step}, jumped_ns - (19 - step) * step_ns
+        )
+    assert found.row(jumped_ns + 1).rate_hz == pytest.approx(STREAM.rate_hz, rel=0.1)
+    single = StreamStats(STREAM, jumped_ns)
+    single.take({"good": True, "valves": (True,) * 8, "flying": True, "step": 500}, jumped_ns)
+    assert single.row(jumped_ns + 1).rate_hz <= 1.01 * STREAM.rate_hz
+
+
 def test_flags_are_those_of_the_window() -> None:
     assert heard(range(2, 402, 2), bad=range(2, 200, 2)).flags == {"good": 1, "flying": 1}
     assert heard(range(2, 402, 2), bad=range(302, 402, 2)).flags == {"good": 0.5, "flying": 1}
