@@ -5,7 +5,7 @@ not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$ : % = \#
 in_path = $(strip $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1)))
 unfit = a path with blanks or with a character that means something to a shell;
 $(if $(call in_path,CURDIR),$(error $(CURDIR): this checkout lies on $(unfit) move it))
-$(foreach name,BUILD KEYS APPS,$(if $(call in_path,$(name)),$(error $(name)=$(value $(name)): is $(unfit) \
+$(foreach name,BUILD KEYS APPS INVENTORY,$(if $(call in_path,$(name)),$(error $(name)=$(value $(name)): is $(unfit) \
     take another directory)))
 export BUILD
 # Names of files are UTF-8 in any user's locale: the virtual environment has the path of the checkout in its files.
@@ -16,7 +16,10 @@ FLOTILLA := $(PYTHON) -m flotilla
 # A part of a command: a line that moves on a terminal, a line at its end without one; what it says when it fails.
 step = $(PYTHON) -m flotilla.common.progress
 Q := $(if $(filter-out 0,$(V)),,@)
-export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS PART PYTHON3
+export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS INVENTORY PART PYTHON3
+# Of these the fleet is fixed; nobody shall think that it was another.
+$(if $(and $(value INVENTORY),$(filter wheeled wheeled-down scenarios check test test-all,$(MAKECMDGOALS))),$(error \
+    INVENTORY=$(value INVENTORY): $(MAKECMDGOALS) has a fleet of its own; leave INVENTORY out))
 # Python imports no packages of the user's, and pip puts none among them.
 unexport PYTHONHOME PYTHONPATH PIP_PREFIX PIP_TARGET PIP_USER
 MAKEFLAGS += --no-print-directory
@@ -404,6 +407,7 @@ help: ## this list
 ##= BUILD=            where outputs go instead of build/
 ##= KEYS=             where keys are instead of ansible/keys/
 ##= APPS=             where apps are instead of apps/
+##= INVENTORY=        the fleet's description instead of ansible/inventory/; wheeled, scenarios and tests have their own
 ##= ANY_HOST=1        set up a computer that is none of the supported hosts
 ##= PYTHON3=          the Python that builds, instead of python3 of the path or of the system
 ##= V=1               show the commands

@@ -1,4 +1,5 @@
-"""Where things lie. Every other module asks here; `BUILD`, `KEYS` and `APPS` come from the environment."""
+"""Where things lie. Every other module asks here; `BUILD`, `KEYS`, `APPS` and `INVENTORY` come from the
+environment."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ OPERATORS = BUILD / "operators"
 GUESTS = BUILD / "fleet" / "guests.yml"
 """Ansible's inventory of the virtual fleet, while it runs."""
 
-INVENTORY = PROJECT / "ansible" / "inventory"
+INVENTORY = Path(os.environ.get("INVENTORY") or PROJECT / "ansible" / "inventory").resolve()
+"""The fleet's description, of every command that is about robots."""
 TASKS = PROJECT / "ansible" / "control_tasks"
 """Control tasks that the inventory gives to robots."""
 MESSAGES = "messages.yml"
@@ -48,7 +50,7 @@ SSH's options read something else in them, and not all of these have a way to qu
 
 def check() -> None:
     """Refuse places where some program of a build or of a playbook would take another path than the one meant."""
-    given = {"": PROJECT, "BUILD=": BUILD, "KEYS=": KEYS, "APPS=": APPS}
+    given = {"": PROJECT, "BUILD=": BUILD, "KEYS=": KEYS, "APPS=": APPS, "INVENTORY=": INVENTORY}
     unfit = {name: path for name, path in given.items() if _unfit(path)}
     if "" in unfit:  # then all that is inside is, too
         unfit = {name: path for name, path in unfit.items() if not name or not path.is_relative_to(PROJECT)}

@@ -46,6 +46,9 @@ def load_fleet(directory: Path | None = None) -> Fleet:
     """The fleet of an inventory, by default the project's; or ProblemsError with all that is wrong in it."""
     paths.check()  # for playbooks, too
     directory = directory or paths.INVENTORY
+    if not directory.is_dir():
+        remedy = "name one with robots.yml and group_vars/"
+        raise UserError(f"INVENTORY={paths.shown(directory)}: there is no such directory; {remedy}")
     sources = Sources(directory)
     try:
         merged = _merged(directory)

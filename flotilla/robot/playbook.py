@@ -23,7 +23,7 @@ def play(playbook: str, *, robot: int | None, guests: bool, words: Sequence[str]
     if guests and not paths.GUESTS.exists():
         raise UserError(f"{paths.shown(paths.GUESTS)} is missing: no virtual fleet runs; start one: make fleet N=4")
     programs = Path(sys.executable).parent
-    argv = [str(programs / "ansible-playbook"), "-i", "inventory"]
+    argv = [str(programs / "ansible-playbook"), "-i", str(paths.INVENTORY)]
     argv += ["-i", str(paths.GUESTS)] if guests else []
     if robot is not None:
         argv += ["-l", inventory.robot(inventory.load_fleet(), robot).name]
@@ -37,5 +37,6 @@ def play(playbook: str, *, robot: int | None, guests: bool, words: Sequence[str]
         "BUILD": str(paths.BUILD),
         "KEYS": str(paths.KEYS),
         "APPS": str(paths.APPS),
+        "INVENTORY": str(paths.INVENTORY),
     }
     os.execve(argv[0], argv, environment)

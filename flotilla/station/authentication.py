@@ -8,6 +8,7 @@ import hmac
 import secrets
 import socket
 import struct
+from collections.abc import Iterable
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
@@ -94,11 +95,17 @@ class Signer:
         return True
 
     def hear(self, one: socket.socket) -> None:
-        """Take the challenges that have come back to a socket, without waiting for any."""
-        with contextlib.suppress(BlockingIOError):
-            for _ in range(_AT_ONCE):
-                with contextlib.suppress(ConnectionRefusedError):  # nobody listened to an earlier message
-                    self.challenged(one.recv(_CHALLENGE + 1, socket.MSG_DONTWAIT))
+        """Take the challenges that have come back to a socket of its own, without waiting for any."""
+        receive_challenges(one, [self])
+
+
+def receive_challenges(one: socket.socket, signers: Iterable[Signer]) -> None:
+    """Hand each challenge that has come back to a socket to the one of its signers that it is for, without waiting."""
+    with contextlib.suppress(BlockingIOError):
+        for _ in range(_AT_ONCE):
+            with contextlib.suppress(ConnectionRefusedError):  # nobody listened to an earlier message
+                datagram = one.recv(_CHALLENGE + 1, socket.MSG_DONTWAIT)
+                any(signer.challenged(datagram) for signer in signers)
 
 
 class Verifier:

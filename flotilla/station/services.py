@@ -28,7 +28,8 @@ _FLOOD = "nft --json list chain inet flotilla flood"
 _TIME = "echo $(chronyc -n ntpdata 2>/dev/null | grep RX)"
 """Answers of time servers: how many came, and how many were valid."""
 _PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
-_SETTINGS = ("ConnectTimeout=5", "ServerAliveInterval=5", "ServerAliveCountMax=2")
+_SETTINGS = ("ServerAliveInterval=5", "ServerAliveCountMax=4")
+"""A busy robot takes its time to let somebody in: no less than `ssh.options` gives every command."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,9 @@ class Services:
 
     def __init__(self, robots: Iterable[Robot]) -> None:
         asked = [robot for robot in robots if robot.control_tasks]
-        self.states = {(robot.name, task): State("asked", True) for robot in asked for task in robot.control_tasks}
+        self.states = {
+            (robot.name, task): State("not answered yet", False) for robot in asked for task in robot.control_tasks
+        }
         """By robot and task, as they were reported last."""
         self.notes: dict[str, tuple[str, ...]] = {robot.name: () for robot in asked}
         """By robot, what else is to be said of it."""

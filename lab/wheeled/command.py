@@ -71,5 +71,6 @@ def said(there: Live, room: str) -> str:
         f"of {there.station_address}, or of any address\n"
         f"drive in a browser: make station {where} {keys}\n"
         f"by keys or gamepad: make drive ROBOT=1 {where} {keys}\n"
-        f"watch: make top {where}    record: make record {where}    end: Ctrl-C or make wheeled-down"
+        f"watch: make top {where} {keys}    record: make record {where} {keys}\n"
+        f"a shell, parameters, signals: make ssh|param|scope ROBOT=1 {where} {keys}    end: Ctrl-C or make wheeled-down"
     )

@@ -34,7 +34,7 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import identity, inventory, message_keys, privileges
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.station import telemetry
-from flotilla.station.authentication import TRAILER, Signer
+from flotilla.station.authentication import TRAILER, Signer, receive_challenges
 from images.builder import build, runtime
 from lab.plants import wheeled
 from lab.qemu import qemu
@@ -293,7 +293,8 @@ class Live:
             (robot,) = (one.robot for one in self.robots if one.robot.name == name)
             key = message_keys.read().between(robot, self.fleet.stations[0])
             signer = self._signers[name, port] = Signer(key, port)
-        signer.hear(forward)
+        # All streams of a robot are sent from one socket.
+        receive_challenges(forward, [other for (sender, _), other in self._signers.items() if sender == name])
         with suppress(ConnectionRefusedError):
             forward.sendto(signer.sign(message[:-TRAILER]), (self.station_address, port))
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 
-from flotilla.station.authentication import TRAILER, Signer, Verdict, Verifier
+from flotilla.station.authentication import TRAILER, Signer, Verdict, Verifier, receive_challenges
 
 KEY, OTHER = "42" * 32, "43" * 32
 PORT = 5020
@@ -64,3 +66,21 @@ def test_a_sender_that_begins_anew_is_taken_again() -> None:
 def test_a_message_without_a_trailer_is_no_message() -> None:
     with pytest.raises(ValueError, match="39 bytes: a trailer has 40"):
         Verifier(KEY, PORT).judge(bytes(39))
+
+
+def test_a_challenge_reaches_its_signer_where_several_send_from_one_socket() -> None:
+    """Seen to fail: the one that received first took the other's, whose messages were never taken."""
+    signers = [Signer(KEY, PORT), Signer(OTHER, PORT)]
+    verifiers = [Verifier(KEY, PORT), Verifier(OTHER, PORT)]
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there,
+    ):
+        here.bind(("127.0.0.1", 0))
+        for turn, expected in ((0, Verdict.UNANSWERED), (1, Verdict.GOOD)):
+            for signer, verifier in zip(reversed(signers), reversed(verifiers), strict=True):
+                verdict, challenge = verifier.judge(signer.sign(b"scan"))
+                assert verdict is expected
+                if not turn:
+                    there.sendto(challenge, here.getsockname())
+            receive_challenges(here, signers)

@@ -46,7 +46,7 @@ GIVEN = {
     "releases": ["ROBOT"],
     "cve": ["TRACKER"],
     "bench": ["ROBOT"],
-    "station": ["PORT", "ADDRESS", "OUT", "REPLAY", "INVENTORY", "SECONDS"],
+    "station": ["PORT", "ADDRESS", "OUT", "REPLAY", "SECONDS"],
     "record": ["PORT", "SECONDS", "ADDRESS"],
     "live": ["OUT", "SECONDS"],
     "top": ["OUT", "PORT"],
@@ -118,6 +118,25 @@ def test_what_is_given_as_words_is_no_command(tmp_path: Path, target: str) -> No
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("target", ["ssh ROBOT=1", "param ROBOT=1 TASK=drive", "scope ROBOT=1 TASK=drive", "provision"])
+def test_the_inventory_reaches_every_program(tmp_path: Path, target: str) -> None:
+    """Seen to fail: these took ansible/inventory, so whoever tuned a simulated robot tuned a real one."""
+    programs = tmp_path / "venv" / "bin"
+    programs.mkdir(parents=True)
+    (programs / "python").write_text(f'#!/bin/sh\necho "$INVENTORY" >>{tmp_path}/said\n')
+    (programs / "python").chmod(0o755)
+    argv = ["make", "-s", "-C", str(paths.PROJECT), *target.split(), f"BUILD={tmp_path}", "INVENTORY=/of/others"]
+    subprocess.run([*argv, "-o", "setup"], capture_output=True, text=True, check=True)
+    assert set((tmp_path / "said").read_text().split()) == {"/of/others"}
+
+
+@pytest.mark.parametrize("target", ["wheeled", "scenarios", "test"])
+def test_a_command_with_a_fleet_of_its_own_refuses_another(target: str) -> None:
+    argv = ["make", "-C", str(paths.PROJECT), "-n", target, "INVENTORY=/of/others"]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    assert (done.returncode, f"INVENTORY=/of/others: {target} has a fleet of its own" in done.stderr) == (2, True)
+
+
 def test_each_variable_is_defined_once() -> None:
     """Seen to fail: of two named `measured`, the one that ran the tests' lanes meant the later one's words."""
     defined = re.findall(r"^([A-Za-z_]+) *[:?]?= ", (paths.PROJECT / "Makefile").read_text(), re.MULTILINE)
@@ -125,7 +144,7 @@ def test_each_variable_is_defined_once() -> None:
     assert "COSTS" in defined
 
 
-@pytest.mark.parametrize("name", ["BUILD", "KEYS", "APPS"])
+@pytest.mark.parametrize("name", ["BUILD", "KEYS", "APPS", "INVENTORY"])
 @pytest.mark.parametrize("character", paths.UNFIT.replace("\n", ""))
 def test_paths_that_a_shell_would_read_are_refused(name: str, character: str) -> None:
     """By make, before anything is installed, and where Python is started without it."""

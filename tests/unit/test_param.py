@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -13,6 +15,7 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Robot
 from flotilla.robot import parameters, ssh
+from lab.wheeled.by_wires import INVENTORY
 
 ROBOT = Robot(name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"))
 
@@ -60,3 +63,23 @@ def test_a_value_may_be_negative(
     monkeypatch.setattr(sys, "argv", ["flotilla", "param", "3", "heading", "a.b", "--", "-1e-3"])
     assert command_line.main() == 0
     assert capsys.readouterr().out == "heading a.b -1e-3\n"
+
+
+@pytest.mark.parametrize("words", [["param", "1", "drive"], ["scope", "1", "drive"], ["ssh", "1"]])
+def test_the_robot_is_that_of_the_inventory_that_was_given(tmp_path: Path, words: list[str]) -> None:
+    """Seen to fail: whoever tuned the simulated rover tuned the robot 1 of the project's own inventory."""
+    described = inventory.load_fleet(INVENTORY).robots[1].address
+    assert described != inventory.load_fleet().robots[1].address
+    for name in ("operator_ed25519", "known_hosts"):
+        (tmp_path / name).touch()
+    (tmp_path / "ssh").write_text('#!/bin/sh\necho "$*"\n')
+    (tmp_path / "ssh").chmod(0o755)
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "KEYS": str(tmp_path)}
+    environment |= {"INVENTORY": str(INVENTORY), "BUILD": str(tmp_path)}
+    argv = [sys.executable, "-m", "flotilla", *words]
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f" {described}" in done.stdout
+    environment["INVENTORY"] = "/nowhere"
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, "INVENTORY=/nowhere: there is no such directory" in done.stderr) == (1, True)

@@ -93,7 +93,7 @@ def test_a_robot_has_the_name_that_the_inventory_gives_it(
     monkeypatch.setattr(paths, "INVENTORY", tmp_path / "inventory")
     playbook.play("fleet", robot=3, guests=False, words=["--check"])
     ((argv, _),) = played
-    assert argv[1:] == ["-i", "inventory", "-l", "alpha", "--check", "fleet.yml"]
+    assert argv[1:] == ["-i", str(tmp_path / "inventory"), "-l", "alpha", "--check", "fleet.yml"]
     with pytest.raises(UserError, match=r"robot 9: no such robot in .*; robots are 1, 2, 3, 4"):
         playbook.play("fleet", robot=9, guests=False, words=[])
 

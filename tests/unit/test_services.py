@@ -13,6 +13,7 @@ import pytest
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
+from flotilla.station import services
 from flotilla.station.services import Answer, State, TaskStatus, ask
 
 ROBOT = Robot(
@@ -46,6 +47,11 @@ def robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     program(tmp_path, "systemctl", f'#!/bin/sh\n[ "$*" = "{words}" ] && exec /bin/cat {tmp_path}/said\n')
     monkeypatch.setattr(ssh, "command", lambda _: [str(tmp_path / "ssh")])
     return tmp_path
+
+
+def test_a_robot_that_lets_in_slowly_is_awaited_as_by_every_command() -> None:
+    """Seen to fail: 5 s here, so a busy robot's tasks were `no answer` for ever."""
+    assert not [setting for setting in services._SETTINGS if setting.startswith("ConnectTimeout")]
 
 
 def program(directory: Path, name: str, script: str) -> None:
