@@ -7,10 +7,16 @@ made to lead here (DNS rebinding) has an origin of its own.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
+import os
+import re
 import secrets
+import stat
+import time
 from collections.abc import Mapping
 from ipaddress import ip_address
+from pathlib import Path
 
 _LOOPBACK = ("127.0.0.1", "[::1]", "localhost")
 POLICY = (
@@ -27,6 +33,28 @@ HEADERS = {
 }
 
 
+_BYTES = 32
+_KEPT_S = 24 * 3600
+"""For so long a token is that of the next start, too."""
+
+
+def _kept(file: Path) -> str:
+    """The token in a file that only this user reads; a new one where there is none, or it is old."""
+    with contextlib.suppress(OSError, ValueError):
+        status = file.stat()
+        token = file.read_text()
+        private = status.st_uid == os.geteuid() and not stat.S_IMODE(status.st_mode) & 0o077
+        if private and 0 <= time.time() - status.st_mtime < _KEPT_S and re.fullmatch(r"[\w-]{43}", token):
+            return token
+    token = secrets.token_urlsafe(_BYTES)
+    with contextlib.suppress(OSError):  # without it, open pages say that they need the new address
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)
+        file.touch(0o600, exist_ok=False)
+        file.write_text(token)
+    return token
+
+
 class RefusedError(Exception):
     """A request that is not answered; says why."""
 
@@ -34,9 +62,10 @@ class RefusedError(Exception):
 class Access:
     """To a page at an address and a TCP port of this computer."""
 
-    def __init__(self, address: str, port: int) -> None:
+    def __init__(self, address: str, port: int, kept: Path | None = None) -> None:
+        """`kept`: a file of the token, so that open pages reach the program again after it was started anew."""
         self._address, self._port = address, port
-        self._token = secrets.token_urlsafe(32)
+        self._token = _kept(kept) if kept else secrets.token_urlsafe(_BYTES)
         self.cookie = f"flotilla-{port}"
         """Its name: cookies know no ports, and two stations may run on one computer."""
 

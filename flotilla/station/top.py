@@ -28,6 +28,10 @@ from flotilla.station.telemetry import Stream
 
 WINDOW_NS = 2_000_000_000
 _LATE = 10
+CURRENT_S = 0.5
+"""What is older is not shown as current."""
+_PERIODS = 2.5
+"""Of a stream that is slower than that: so many, for one datagram to be lost."""
 """Datagrams by which one may be overtaken, what is further back is a start anew; that may stay away unremarked."""
 HEALTH = ("good", "flag")
 """Names, or ends of them, of flags that are true when all is well."""
@@ -79,8 +83,8 @@ class Row:
         return ", ".join(f"{count} {kind}" for kind, count in self.attempts.items())
 
     def silent(self, stream: Stream) -> bool:
-        """Whether nothing came of its stream for as long as ten datagrams take."""
-        return self.age_s is None or self.age_s * stream.rate_hz > _LATE
+        """Whether what came last of its stream is not current any more."""
+        return self.age_s is None or self.age_s > max(CURRENT_S, _PERIODS / stream.rate_hz)
 
 
 class _Came(NamedTuple):
@@ -251,11 +255,16 @@ class Top:
                 _marked(f"{count.bad}", count.bad > 0),
                 "" if row.lost is None else _marked(f"{row.lost}", row.lost > 0),
                 "" if row.lost is None or not sent else f"{100 * row.lost / sent:.1f}",
-                "" if row.link is None else _marked(f"{100 * row.link:.0f}", row.link < _GOOD_LINK),
+                ""
+                if row.link is None
+                else _marked(
+                    "old" if silent and row.link else f"{100 * row.link:.0f}", silent or row.link < _GOOD_LINK
+                ),
                 _marked("never" if row.age_s is None else f"{row.age_s:.2f}", silent),
                 "" if row.charge is None else _marked(f"{100 * row.charge:.0f}", row.charge < _LOW_CHARGE),
                 Text(", ").join(_flag(name, share) for name, share in row.flags.items()),
                 *_asked(self._states.get((stream.robot, stream.task))),
+                style="dim" if silent else "",
             )
         for robot, task in tasks[len(self._known) :]:
             state = self._states[robot, task]

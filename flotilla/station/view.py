@@ -54,6 +54,8 @@ class _Drawn:
 class _Path:
     points: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_PATH_POINTS))
     pose: tuple[float, float, float] | None = None
+    topic: str = ""
+    """Whose last message it is from."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class View:
         self._stats[topic].take(values, received_ns)
         self._last[topic] = values
         if drawn.pose:
-            self._move(stream.robot, [of(values) for of in drawn.pose])
+            self._move(topic, stream.robot, [of(values) for of in drawn.pose])
         if drawn.ranges:
             self._scans[stream.robot] = self._scan(stream.robot, drawn, values[drawn.ranges])
         for follower in self._followers[topic]:
@@ -135,8 +137,15 @@ class View:
             "now": now_ns / 1e9,
             "streams": {stream.topic: self._stream(stream, now_ns) for stream in self._known},
             "poses": {robot: path.pose for robot, path in self._paths.items()},
+            "old": sorted(self._old(now_ns)),
             "strangers": self._receiver.strangers,
         }
+
+    def _old(self, now_ns: int) -> set[str]:
+        """Robots whose pose or scan is not current any more."""
+        drawn = {(path.topic, robot) for robot, path in self._paths.items()}
+        drawn |= {(topic, self.by_topic[topic].robot) for topic in self._last if self._drawn[topic].ranges}
+        return {robot for topic, robot in drawn if self._stats[topic].row(now_ns).silent(self.by_topic[topic])}
 
     def scans(self) -> dict[str, Json]:
         """By robot, those that came since this was asked before."""
@@ -162,11 +171,12 @@ class View:
             },
         }  # fmt: skip
 
-    def _move(self, robot: str, pose: list[float]) -> None:
+    def _move(self, topic: str, robot: str, pose: list[float]) -> None:
         if not all(map(isfinite, pose)):
             return
         path = self._paths.setdefault(robot, _Path())
         x, y, heading = pose
+        path.topic = topic
         path.pose = (round(x, 4), round(y, 4), round(heading, 4))
         if not path.points or hypot(x - path.points[-1][0], y - path.points[-1][1]) >= _PATH_STEP_M:
             path.points.append(path.pose[:2])

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from aiohttp import WSCloseCode, web
 
+from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.station.access import HEADERS, Access, RefusedError
 from flotilla.station.desk import Desk
@@ -56,7 +57,8 @@ class Web:
         except OSError as error:
             remedy = "give another port or address of this computer: PORT= ADDRESS="
             raise UserError(f"TCP port {self._port} of {self._address}: {error.strerror}; {remedy}") from error
-        self._access = Access(self._address, self._runner.addresses[0][1])
+        port = self._runner.addresses[0][1]
+        self._access = Access(self._address, port, paths.BUILD / "run" / f"page-{port}.token")
         return self._access.url
 
     async def end(self) -> None:

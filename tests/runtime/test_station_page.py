@@ -10,6 +10,8 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
+import signal
 import socket
 import statistics
 import threading
@@ -23,7 +25,10 @@ from typing import IO
 import pytest
 from websockets.exceptions import InvalidStatus
 
+from flotilla.fleet import inventory
+from flotilla.station import telemetry
 from flotilla.station.authentication import TRAILER
+from flotilla.station.record import Recorder
 from tests.browser import Browser, Page
 from tests.figures import PROPERTY
 from tests.running import PATIENCE
@@ -495,6 +500,61 @@ def test_a_recording_is_made_and_replayed(
         again.until("document.querySelector('#play').textContent === 'Play'")
         assert again.complaints == []
         again.close()
+
+
+def test_nothing_is_shown_as_current_while_the_station_hangs(driver: Page, served: Station) -> None:
+    """Seen to fail: green, `connected`, `link 100 %` and old speeds for as long as it hung."""
+    driver.until("document.querySelector('#chart').dataset.old === ''")
+    served.process.send_signal(signal.SIGSTOP)
+    try:
+        driver.until("document.querySelector('#link').textContent.startsWith('the station has said nothing for ')")
+        driver.until("document.querySelector('#chart').dataset.old === 'rover'")
+        for selector, shown in (
+            ("#link", "pill bad"), (".robot .pill", "pill bad"), ("#holder", "pill bad"), ("#tasks .pill", "pill bad"),
+        ):  # fmt: skip
+            assert driver.value(f"document.querySelector('{selector}').className") == shown
+        assert re.fullmatch(r"\d+\.\d s old", driver.text(".robot .pill"))
+        assert "m/s" not in driver.text("#drive")
+        assert driver.value("getComputedStyle(document.querySelector('.robot .figures')).opacity") < "0.5"
+        assert driver.value("document.querySelector('#enable').disabled")
+    finally:
+        served.process.send_signal(signal.SIGCONT)
+    driver.until("document.querySelector('#link').textContent === 'connected'")
+    driver.until("document.querySelector('#chart').dataset.old === ''")
+    driver.until("document.querySelector('.robot .pill').textContent.startsWith('link ')")
+
+
+def test_open_pages_reach_a_station_that_was_started_anew_or_say_why_not(
+    browser: Browser, fleet: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    """Seen to fail: they were dead for ever, and said `not connected` and nothing else."""
+    recorded, own = tmp_path / "run.mcap", environment | {"BUILD": str(tmp_path)}
+    streams = telemetry.streams(inventory.load_fleet(fleet))
+    recorder = Recorder(streams, recorded)
+    for stream in streams:
+        recorder.take(
+            stream, {each.name: (0.0,) * each.width if each.width > 1 else 0 for each in stream.fields}, 10**18
+        )
+    recorder.end()
+    with station(fleet, "station", "--port", "0", "--replay", recorded, environment=own) as process:
+        first = Station(process)
+        page = browser.page()
+        page.open(first.url)
+        page.until("document.querySelector('#link').textContent === 'connected'")
+    port = first.host.rpartition(":")[2]
+    page.until(
+        "document.querySelector('#link').textContent === 'not connected: the station does not answer: is it running?'"
+    )
+    with station(fleet, "station", "--port", port, "--replay", recorded, environment=own) as process:
+        assert Station(process).token == first.token
+        page.until("document.querySelector('#link').textContent === 'connected'")
+    (kept,) = tmp_path.glob("run/page-*.token")
+    assert kept.stat().st_mode & 0o777 == 0o600
+    kept.chmod(0o644)  # others may have read it
+    with station(fleet, "station", "--port", port, "--replay", recorded, environment=own) as process:
+        assert Station(process).token != first.token
+        page.until("document.querySelector('#link').textContent.endsWith('open the address that it printed')")
+    page.close()
 
 
 def test_a_browser_that_does_not_read_disturbs_nobody(served: Station, page: Page) -> None:

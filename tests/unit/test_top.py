@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 
 import pytest
@@ -81,6 +82,17 @@ def test_a_silent_stream_has_age_and_no_rate() -> None:
     assert found.row(2 * SECOND_NS) == row(0.5, {"good": 0, "flying": 1}, age_s=1)
     assert found.row(9 * SECOND_NS) == row(0, {"good": 0, "flying": 1}, link=0, age_s=8)
     assert StreamStats(STREAM, 0).row(SECOND_NS) == row(0, {}, link=0, age_s=None)
+
+
+@pytest.mark.parametrize(
+    ("every", "age_s", "silent"), [(2, 0.49, False), (2, 0.51, True), (100, 2.4, False), (100, 2.6, True)]
+)
+def test_nothing_older_than_half_a_second_is_current(every: int, age_s: float, silent: bool) -> None:
+    """But for streams that come less often. Seen to fail: ten datagrams' time, of 1 Hz ten seconds."""
+    stream = dataclasses.replace(STREAM, every=every)
+    found = StreamStats(stream, 0)
+    found.take({"step": 1, "good": True, "valves": (True,) * 8, "flying": True}, SECOND_NS)
+    assert found.row(SECOND_NS + round(age_s * SECOND_NS)).silent(stream) is silent
 
 
 def test_the_rate_after_a_jump_of_a_replay_is_that_of_the_messages_before_it() -> None:

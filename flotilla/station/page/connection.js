@@ -52,11 +52,23 @@ export class Connection {
       if (message.type === "answer") this.#answer(message);
       for (const listener of this.#listeners.get(message.type) ?? []) listener(message);
     };
-    socket.onclose = ({ reason }) => {
+    socket.onclose = async ({ reason }) => {
       for (const id of [...this.#answers.keys()]) this.#answer({ id, good: false, text: "the connection broke" });
-      this.onopen(false, reason);
+      this.onopen(false, reason ? `the station closed the connection: ${reason}` : "the station does not answer");
+      if (!reason) this.onopen(false, await this.#why());
       setTimeout(() => this.#connect(), AGAIN_MS[Math.min(this.#tries++, AGAIN_MS.length - 1)]);
     };
+  }
+
+  /** A browser does not say why a WebSocket was refused; the same question by HTTP is answered with the reason. */
+  async #why() {
+    try {
+      const { status } = await fetch(location.pathname, { cache: "no-store" });
+      if (status === 403) return "the station was started anew, with another token: open the address that it printed";
+      return status === 200 ? "the connection broke" : `the station answers with status ${status}`;
+    } catch {
+      return "the station does not answer: is it running?";
+    }
   }
 
   #answer({ id, good, text }) {

@@ -102,6 +102,26 @@ export class Drive {
     text(this.why, mine ? held.error || held.note : held.holder && !offered ? `You cannot command: ${held.holder} does. Ask for it, and the holder can hand it over.` : held.note);
   }
 
+  /** Nothing comes from the station: it stops the robot by itself, and who commands is not known. */
+  lose(words) {
+    if (!this.#robot || !this.controls) return;
+    if (this.#mine) this.rest();
+    this.#held = null;
+    this.#enable = false;
+    this.#boomKnown = false;
+    text($("holder"), "not known");
+    $("holder").className = "pill bad";
+    for (const each of [this.take, this.ask, this.accept, this.leave]) each.hidden = true;
+    this.enable.disabled = this.boom.disabled = true;
+    this.enable.classList.remove("on");
+    text(this.enable, "Switch motors on");
+    this.stick.classList.add("off");
+    for (const out of [this.out.speed, this.out.turn, this.out.boom]) text(out, "–");
+    this.flags.dataset.shown = "";
+    this.flags.replaceChildren(make("span", { className: "chip bad" }, "no reports"));
+    text(this.why, `You command nothing: ${words}.`);
+  }
+
   get #mine() {
     return this.#held?.by === this.you;
   }

@@ -89,13 +89,21 @@ export class Fleet {
     }
   }
 
+  /** Nothing comes from the station. */
+  age(s) {
+    for (const { link } of this.#cards.values()) {
+      text(link, `${number(s, 1)} s old`);
+      link.className = "pill bad";
+    }
+  }
+
   #showLink(card, rows) {
     const silent = rows.every((row) => row.silent);
     const links = rows.filter((row) => row.link !== null && !row.silent).map((row) => row.link);
     const link = links.length ? Math.min(...links) : null;
     const words = !rows.length ? "no reports" : silent ? "silent" : link === null ? "heard" : `link ${Math.round(100 * link)} %`;
     text(card.link, words);
-    const how = !rows.length ? "" : silent ? "bad" : link !== null && link < LOW_LINK ? "warn" : "good";
+    const how = !rows.length ? "" : silent ? "bad" : rows.some((row) => row.silent) ? "warn" : link !== null && link < LOW_LINK ? "warn" : "good";
     card.link.className = `pill ${how}`;
   }
 
@@ -103,11 +111,13 @@ export class Fleet {
     const parts = [];
     for (const stream of own) {
       const row = state.streams[stream.topic];
-      if (row.charge !== null) parts.push(["battery", `${Math.round(100 * row.charge)} %`, row.charge < LOW_CHARGE]);
+      const was = row.silent ? " (old)" : "";
+      if (row.charge !== null) parts.push(["battery", `${Math.round(100 * row.charge)} %${was}`, was || row.charge < LOW_CHARGE]);
       for (const flag of row.bad) parts.push([stream.task, `not ${flag}`, true]);
     }
     const pose = state.poses[robot.name];
-    if (pose) parts.push(["at", `${number(pose[0])}, ${number(pose[1])} m`, false]);
+    const old = state.old.includes(robot.name);
+    if (pose) parts.push([old ? "was at" : "at", `${number(pose[0])}, ${number(pose[1])} m`, old]);
     const tasks = robot.tasks.map((task) => state.tasks[`${robot.name} ${task}`]).filter(Boolean);
     const running = tasks.filter((task) => task.good).length;
     if (tasks.length) parts.push(["tasks", `${running} of ${tasks.length} well`, running < tasks.length]);

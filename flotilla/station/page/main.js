@@ -10,21 +10,39 @@ import { Tasks } from "./tasks.js";
 
 if (location.search) history.replaceState(null, "", location.pathname); // the token is in a cookie now
 
+let fleet, map, drive, tasks;
+const CURRENT_MS = 500; // what is older is not shown as current
+let heardMs = performance.now();
+let lost = "connecting"; // why there is no connection; empty: there is one
 const connection = new Connection((open, reason) => {
-  text($("link"), open ? "connected" : "not connected");
-  $("link").className = `pill ${open ? "good" : "bad"}`;
-  if (!open) {
-    drive.rest();
-    if (reason) toast(`The station closed the connection: ${reason}`);
-  }
+  heardMs = performance.now();
+  lost = open ? "" : `not connected: ${reason}`;
+  if (!open) drive?.rest();
+  look();
 });
-const fleet = new Fleet((robot) => {
+
+/** Whether what the page shows is current, or since when it is not. */
+function look() {
+  const age = performance.now() - heardMs;
+  const old = Boolean(lost) || age > CURRENT_MS;
+  const words = lost || (old ? `the station has said nothing for ${number(age / 1000, 1)} s` : "connected");
+  text($("link"), words);
+  $("link").className = `pill ${old ? "bad" : "good"}`;
+  document.body.classList.toggle("old", old);
+  map?.age(old);
+  if (!old) return;
+  fleet?.age(age / 1000);
+  drive?.lose(words);
+  tasks?.lose();
+}
+setInterval(look, 100);
+fleet = new Fleet((robot) => {
   drive?.choose(robot);
   tasks?.choose(robot);
 });
-const map = new Map2d(fleet);
-const drive = new Drive(connection, fleet);
-const tasks = new Tasks(connection, fleet);
+map = new Map2d(fleet);
+drive = new Drive(connection, fleet);
+tasks = new Tasks(connection, fleet);
 const plots = new Plots(connection, fleet);
 const notes = $("notes").querySelector("ol");
 
@@ -59,6 +77,8 @@ connection.on("begin", ({ paths }) => {
 connection.on("note", note);
 connection.on("scans", ({ scans }) => map.scan(scans));
 connection.on("state", (state) => {
+  heardMs = performance.now();
+  look();
   fleet.show(state);
   map.show(state, fleet.free(state));
   drive.show(state);

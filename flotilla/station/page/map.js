@@ -14,6 +14,8 @@ export class Map2d {
   #paths = new Map();
   #scans = new Map();
   #poses = {};
+  #old = new Set(); // robots whose pose or scan is not current
+  #allOld = false;
   #free = {};
   #scale = 90; // px/m
   #centre = [0, 0];
@@ -56,6 +58,7 @@ export class Map2d {
 
   show(state, free) {
     this.#poses = state.poses;
+    this.#old = new Set(state.old);
     this.#free = free;
     for (const [robot, [x, y]] of Object.entries(state.poses)) {
       if (!this.#paths.has(robot)) this.#paths.set(robot, []);
@@ -67,6 +70,17 @@ export class Map2d {
     const chosen = state.poses[this.fleet.chosen];
     if (chosen && $("follow").checked && !this.#pointers.size) this.#centre = [chosen[0], chosen[1]];
     this.#draw();
+  }
+
+  /** Whether nothing comes from the station. */
+  age(old) {
+    if (old === this.#allOld) return;
+    this.#allOld = old;
+    this.#draw();
+  }
+
+  #isOld(robot) {
+    return this.#allOld || this.#old.has(robot);
   }
 
   /** A scan is drawn from where the robot was. */
@@ -161,7 +175,7 @@ export class Map2d {
       pen.fillStyle = colour(this.fleet.index(robot));
       const dot = Math.max(1.5, Math.min(4, scale / 40));
       kept.forEach((scan, age) => {
-        pen.globalAlpha = age === kept.length - 1 ? 0.95 : 0.1 + (0.22 * age) / kept.length;
+        pen.globalAlpha = age === kept.length - 1 && !this.#isOld(robot) ? 0.95 : 0.1 + (0.22 * age) / kept.length;
         for (let i = 0; i < scan.length; i += 2) pen.fillRect(X(scan[i]) - dot / 2, Y(scan[i + 1]) - dot / 2, dot, dot);
       });
       pen.globalAlpha = 1;
@@ -175,6 +189,7 @@ export class Map2d {
       pen.stroke();
       pen.globalAlpha = 1;
     }
+    canvas.dataset.old = Object.keys(this.#poses).filter((robot) => this.#isOld(robot)).join(" ");
     for (const [robot, pose] of Object.entries(this.#poses)) if (pose) this.#robot(pen, robot, pose, X, Y);
   }
 
@@ -214,8 +229,10 @@ export class Map2d {
   #robot(pen, robot, [x, y, heading], X, Y) {
     const paint = colour(this.fleet.index(robot));
     const size = Math.max(9, RADIUS_M * this.#scale);
-    const free = this.#free[robot];
+    const old = this.#isOld(robot);
+    const free = old ? null : this.#free[robot];
     pen.save();
+    if (old) pen.globalAlpha = 0.35;
     pen.translate(X(x), Y(y));
     pen.rotate(-heading);
     if (free !== undefined && free !== null) {
@@ -233,12 +250,13 @@ export class Map2d {
       pen.stroke();
     }
     pen.fillStyle = paint;
-    pen.globalAlpha = 0.22;
+    pen.globalAlpha = old ? 0.05 : 0.22;
     pen.beginPath();
     pen.arc(0, 0, size, 0, 2 * Math.PI);
     pen.fill();
-    pen.globalAlpha = 1;
+    pen.globalAlpha = old ? 0.35 : 1;
     pen.strokeStyle = paint;
+    pen.setLineDash(old ? [4, 4] : []);
     pen.lineWidth = robot === this.fleet.chosen ? 2.5 : 1.5;
     pen.stroke();
     pen.beginPath();
@@ -252,7 +270,7 @@ export class Map2d {
     pen.fillStyle = css("--text");
     pen.font = "600 12px system-ui, sans-serif";
     pen.textAlign = "center";
-    pen.fillText(robot, X(x), Y(y) + size + 15);
+    pen.fillText(old ? `${robot} was here` : robot, X(x), Y(y) + size + 15);
     pen.textAlign = "left";
   }
 }

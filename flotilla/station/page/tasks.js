@@ -52,6 +52,15 @@ export class Tasks {
     }
   }
 
+  /** Nothing comes from the station. */
+  lose() {
+    for (const { words, facts } of this.#tasks.values()) {
+      text(words, "not known");
+      words.className = "pill bad";
+      text(facts, "");
+    }
+  }
+
   #task(robot, task) {
     const words = make("span", { className: "pill" });
     const facts = make("div", { className: "quiet" });
