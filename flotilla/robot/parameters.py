@@ -18,6 +18,7 @@ def param(robot: Robot, task: str, parameter: str | None = None, value: str | No
     return ssh.output(robot, words)
 
 
-def service(robot: Robot, tasks: Sequence[str], do: str) -> str:
-    """Start or stop control tasks, all at once, as the playbook `tasks.yml` does. UserError as above."""
-    return ssh.output(robot, ["sudo", "systemctl", do, *(f"flotilla-task@{task}.service" for task in tasks)])
+def service(robot: Robot, tasks: Sequence[str], do: str, by: Sequence[str] | None = None) -> str:
+    """Start or stop control tasks, all at once, as the playbook `tasks.yml` does. UserError as above. `by`: another way
+    there than a new connection."""
+    return ssh.output(robot, ["sudo", "systemctl", do, *(f"flotilla-task@{task}.service" for task in tasks)], by)

@@ -81,7 +81,7 @@ class Access:
         return f"{self.cookie}={token}; Path=/; HttpOnly; SameSite=Strict"
 
     def check(self, headers: Mapping[str, str], cookie: str, token: str, *, socket: bool) -> None:
-        """RefusedError. `token`: of the address; `socket`: a WebSocket is asked for."""
+        """RefusedError. `token`: of the address; `socket`: a WebSocket is asked for, or something is to be done."""
         host = headers.get("Host", "")
         name, _, port = host.rpartition(":")
         if not self._is_ours(name) or port != str(self._port):
@@ -90,7 +90,7 @@ class Access:
         if origin is not None and origin != f"http://{host}":
             raise RefusedError("Origin is another page")
         if socket and origin is None:
-            raise RefusedError("a WebSocket without Origin")
+            raise RefusedError("a request without Origin")
         given = [each for each in (cookie, token) if each]
         if not any(hmac.compare_digest(each.encode(), self._token.encode()) for each in given):
             raise RefusedError("no token, or not this program's")

@@ -6,6 +6,7 @@ Nothing here waits for a robot in the loop: ssh runs in threads, and answers com
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import sys
 import time
@@ -22,7 +23,7 @@ from flotilla.fleet.model import Fleet, Robot
 from flotilla.robot import parameters, scope
 from flotilla.station import page_requests as asked
 from flotilla.station import watching
-from flotilla.station.driving import Driving
+from flotilla.station.driving import STOP_S, TASK, Driving
 from flotilla.station.receiver import Receiver
 from flotilla.station.record import Recorder
 from flotilla.station.recording import Value
@@ -32,6 +33,10 @@ from flotilla.station.session import Session
 from flotilla.station.telemetry import Stream
 from flotilla.station.view import Follower, View
 
+ACKNOWLEDGED_S = 1.0
+"""Where a robot has not acknowledged a stop by then, there is an alarm."""
+MOTORS = ("left", "right", "boom_enabled")
+"""Signals of a driven robot's report that are false when its motors are off."""
 WATCHES = 4
 """Of a browser; a task serves four watchers, too."""
 NOTES = 50
@@ -39,6 +44,20 @@ NOTES = 50
 _THREADS = 8
 _MOST_ROBOTS = 250
 _ROWS_S = 0.1
+
+
+@dataclass
+class _Stop:
+    """Of a robot, under way."""
+
+    robot: str
+    begun_s: float = field(default_factory=time.monotonic)
+    acknowledged: asyncio.Event = field(default_factory=asyncio.Event)
+    follower: Follower | None = None
+
+    @property
+    def age_s(self) -> float:
+        return time.monotonic() - self.begun_s
 
 
 @dataclass
@@ -116,6 +135,7 @@ class Desk:
         view: View,
         states: Mapping[tuple[str, str], State],
         notes: Mapping[str, Sequence[str]],
+        way: Callable[[Robot], Sequence[str]],
         replay: Replay | None,
         driving: Driving,
     ) -> None:
@@ -130,12 +150,15 @@ class Desk:
         self._states = states
         self._said = notes
         self._replay = replay
+        self._way = way
         self.recording = Recording(list(receiver.known.values()), self.note)
         self._open: dict[Session, _Open] = {}
         self._notes: deque[dict[str, Any]] = deque(maxlen=NOTES)
         self._threads = ThreadPoolExecutor(_THREADS, "asks")
         self._stopping = ThreadPoolExecutor(_MOST_ROBOTS, "stops")  # never behind anything else
         self._running: set[asyncio.Task[None]] = set()
+        self._stops: dict[str, list[_Stop]] = {}
+        """By robots whose tasks are being stopped: who waits for it."""
 
     # What goes to browsers
 
@@ -223,7 +246,7 @@ class Desk:
         """At once, or begun: what takes longer answers later."""
         match request:
             case asked.StopAll():
-                self._stop_all(session)
+                self.stop_all(f"browser {session.number}")
             case asked.Unwatch():
                 self._unwatch(session, request.id)
             case asked.Play():
@@ -351,30 +374,76 @@ class Desk:
             session, request, lambda robot: parameters.service(robot, [request.task], request.action) or "done", told
         )  # fmt: skip
 
-    def _stop_all(self, session: Session) -> None:
-        """Robots at once, each by a thread of its own."""
+    def stop_all(self, who: str) -> list[str]:
+        """Stop all robots at once: those that are driven by a signed command, which they acknowledge by their reports,
+        and the tasks of all by ssh. The names of the robots; what they say comes to all browsers."""
         robots = [] if self._replay else [robot for robot in self._robots.values() if robot.control_tasks]
-        for name in self._vehicles:
-            holder = self._driving.state(name).holder
-            if holder:
-                self._driving.release(name, holder.id)
-        self.note(f"browser {session.number}: stop all: {len(robots)} robots")
-
-        async def stop(robot: Robot) -> None:
-            begun_s = time.monotonic()
-            self._tell_all({"type": "stopped", "robot": robot.name, "good": None, "text": "stopping"})
-            try:
-                await asyncio.get_running_loop().run_in_executor(
-                    self._stopping, parameters.service, robot, robot.control_tasks, "stop"
-                )
-                good, text = True, f"stopped after {time.monotonic() - begun_s:.1f} s"
-            except (UserError, OSError, ValueError) as error:
-                good, text = False, f"{error}"
-            self._tell_all({"type": "stopped", "robot": robot.name, "good": good, "text": text})
-            self.note(f"stop all: {robot.name}: {text}")
-
+        self.note(f"{who}: stop all: {len(robots)} robots")
         for robot in robots:
-            self._begin(stop(robot))
+            stop = _Stop(robot.name)
+            if robot.name in self._vehicles:
+                self._command_stop(robot.name, stop)
+            under_way = self._stops.setdefault(robot.name, [])
+            under_way.append(stop)
+            if len(under_way) == 1:
+                self._begin(self._stop_tasks(robot, stop))
+            self._begin(self._watch_stop(stop))
+        return [robot.name for robot in robots]
+
+    def _tell_stop(self, stop: _Stop, *, good: bool | None, text: str) -> None:
+        self._tell_all(
+            {"type": "stopped", "robot": stop.robot, "good": good, "acknowledged": stop.acknowledged.is_set(),
+             "text": text}
+        )  # fmt: skip
+
+    def _command_stop(self, robot: str, stop: _Stop) -> None:
+        """By datagrams, which robots acknowledge by reports that their motors are off."""
+        begun_ns = time.time_ns()
+        stream = self._view.task_stream(robot, TASK, MOTORS)
+
+        def take(row: list[Any]) -> None:
+            if not stop.acknowledged.is_set() and 1e9 * row[0] >= begun_ns and not any(row[1:]):
+                stop.acknowledged.set()
+                self._tell_stop(stop, good=None, text=f"motors off after {stop.age_s:.1f} s")
+
+        if stream:
+            stop.follower = self._view.follow(stream.topic, MOTORS, take)
+        try:
+            self._driving.stop(robot)
+        except (UserError, OSError) as error:
+            self.note(f"stop all: {robot}: {error}")
+
+    async def _stop_tasks(self, robot: Robot, stop: _Stop) -> None:
+        """By ssh, over the connection that is there; if that does not do it, by a new one."""
+        self._tell_stop(stop, good=None, text="stopping")
+        run = asyncio.get_running_loop().run_in_executor
+        try:
+            try:
+                await run(self._stopping, parameters.service, robot, robot.control_tasks, "stop", self._way(robot))
+            except UserError:
+                await run(self._stopping, parameters.service, robot, robot.control_tasks, "stop")
+            good, text = True, f"stopped after {stop.age_s:.1f} s"
+            for each in self._stops[robot.name]:
+                each.acknowledged.set()
+        except (UserError, OSError, ValueError) as error:
+            good, text = False, f"{error}"
+        finally:
+            del self._stops[robot.name]
+        self._tell_stop(stop, good=good, text=text)
+        self.note(f"stop all: {robot.name}: {text}")
+
+    async def _watch_stop(self, stop: _Stop) -> None:
+        """An alarm where nothing has come back by then."""
+        try:
+            await asyncio.wait_for(stop.acknowledged.wait(), ACKNOWLEDGED_S)
+        except TimeoutError:
+            text = f"NOT acknowledged within {ACKNOWLEDGED_S:g} s"
+            self._tell_stop(stop, good=None, text=text)
+            self.note(f"stop all: {stop.robot}: {text}")
+        if stop.follower:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.acknowledged.wait(), STOP_S)
+            self._view.leave(stop.follower)
 
     def _record(self, session: Session, request: asked.Record) -> None:
         try:

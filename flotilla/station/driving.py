@@ -50,6 +50,8 @@ DEAD_MAN_S = 0.3
 """An older input moves nothing: whoever drives repeats it while the key is held."""
 SILENT_S = 5.0
 """A holder without any input for so long holds nothing any more."""
+STOP_S = 10.0
+"""For so long rest is sent after a stop: other ways of stopping, by ssh, take some seconds."""
 APART_S = 1.2
 """From the last datagram of one hold to the first of the next: the robot takes two that speak within 1 s for a
 conflict (`guard.apart` of drive.yml)."""
@@ -146,7 +148,8 @@ class HeldError(Refused):
 @dataclass
 class _Hold:
     operator: Operator
-    lock: IO[str]
+    lock: IO[str] | None
+    """None: of a stop, which asks nobody."""
     heard_s: float
     """When the holder last said anything."""
     number: int = field(default_factory=lambda: secrets.randbelow(2**32 - 1) + 1)
@@ -168,6 +171,9 @@ class _Channel:
     """When the last datagram left."""
     not_before_s: float = -math.inf
     """The hold's first datagram has to wait until then."""
+    stop: _Hold | None = None
+    """Rest is sent in its name, whoever commands elsewhere: a robot that two command stops."""
+    stop_until_s: float = -math.inf
     note: str = ""
     error: str = ""
 
@@ -220,6 +226,7 @@ class Driving:
             channel.signer = channel.signer or self._signer(channel.vehicle)
             if channel.hold and channel.hold.operator.id != operator.id:
                 raise HeldError(robot, channel.hold.operator.name)
+            channel.stop = None
             if not channel.hold:
                 self._begin(channel, operator, _locked(self._locks, robot, operator))
 
@@ -244,6 +251,7 @@ class Driving:
                 )
                 raise Refused(f"{robot}: it is not offered to {operator}: {holder}")
             self._halt(channel)
+            assert hold.lock
             self._begin(channel, hold.offered, _signed(hold.lock, hold.offered))
 
     def release(self, robot: str, operator: str) -> None:
@@ -251,6 +259,23 @@ class Driving:
         with self._lock:
             self._hold(robot, operator)
             self._end(self._channel(robot), "")
+
+    def stop(self, robot: str) -> None:
+        """End what anybody holds, and send rest with motors off at once and for STOP_S, or until somebody takes the
+        robot here. UserError names the keys that this computer lacks."""
+        with self._lock:
+            channel = self._channel(robot)
+            channel.signer = channel.signer or self._signer(channel.vehicle)
+            stop = _Hold(Operator("stop", "stop all"), None, self._clock(), input=Motion(0.0, 0.0, 0.0, False))
+            if before := channel.hold or channel.stop:  # the robot goes on to obey whom it obeys
+                stop.number, stop.sequence = before.number, before.sequence
+                boom = before.input.boom if before.input else 0.0
+                stop.input = Motion(0.0, 0.0, boom, False)
+            if channel.hold and channel.hold.lock:
+                channel.hold.lock.close()
+            channel.hold, channel.note, channel.stop = None, "stopped", stop
+            channel.stop_until_s = self._clock() + STOP_S
+            self._send_stop(channel)
 
     def drive(self, robot: str, operator: str, v: float, omega: float, boom: float, enable: bool) -> None:
         """The holder's newest input: `v` in m/s, `omega` in rad/s, `boom` in m, clipped to the robot's limits. Give it
@@ -291,7 +316,9 @@ class Driving:
             self._listen()
             for channel in self._channels.values():
                 hold, now_s = channel.hold, self._clock()
-                if hold and now_s - hold.heard_s > SILENT_S:
+                if channel.stop and now_s < channel.stop_until_s:
+                    self._send_stop(channel)
+                elif hold and now_s - hold.heard_s > SILENT_S:
                     self._end(channel, f"{hold.operator.name} said nothing for {SILENT_S:g} s and commands no more")
                 elif hold and (motion := self._due(channel, now_s)[0]):
                     self._transmit(channel, hold, motion)
@@ -355,7 +382,8 @@ class Driving:
     def _end(self, channel: _Channel, note: str) -> None:
         assert channel.hold
         self._halt(channel)
-        channel.hold.lock.close()
+        if channel.hold.lock:
+            channel.hold.lock.close()
         channel.hold, channel.note = None, note
 
     def _due(self, channel: _Channel, now_s: float) -> tuple[Motion | None, str]:
@@ -374,6 +402,10 @@ class Driving:
         hold = channel.hold
         if hold and hold.input and hold.sequence:
             self._transmit(channel, hold, hold.input.resting)
+
+    def _send_stop(self, channel: _Channel) -> None:
+        if channel.stop and channel.stop.input:
+            self._transmit(channel, channel.stop, channel.stop.input)
 
     def _transmit(self, channel: _Channel, hold: _Hold, motion: Motion) -> None:
         hold.sequence = (hold.sequence + 1) % 2**32

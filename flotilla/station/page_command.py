@@ -55,7 +55,7 @@ async def _serve(
     view = View(receiver, replay.clock if replay else time.time_ns)
     receiver.sinks.append(view)
     services, trouble = (Services(()), "") if replay else _services(fleet)
-    desk = Desk(fleet, receiver, view, services.states, services.notes, replay, driving)
+    desk = Desk(fleet, receiver, view, services.states, services.notes, services.way, replay, driving)
     receiver.sinks.append(desk.recording)
     sockets = [] if replay else listen((stream.port for stream in receiver.known.values()), arguments.address)
     for one in sockets:

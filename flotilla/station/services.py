@@ -7,9 +7,10 @@ import json
 import re
 import shlex
 import subprocess
+import tempfile
 import threading
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -81,8 +82,9 @@ class Answer:
     as a flood; answers that were no time server's."""
 
 
-def ask(robot: Robot) -> Generator[Answer, None, None]:
-    """What it says, again and again, until UserError says why it does not answer any more."""
+def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, None]:
+    """What it says, again and again, until UserError says why it does not answer any more. `shared`: options of ssh by
+    which others use the connection, too."""
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
     longest = 4 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
@@ -92,7 +94,7 @@ def ask(robot: Robot) -> Generator[Answer, None, None]:
     before: dict[str, State] = {}
     program, *way = ssh.command(robot)
     options = [word for setting in _SETTINGS for word in ("-o", setting)]
-    argv = [*DIE_WITH_PARENT, program, *options, *way, shlex.join(["sudo", "sh", "-c", script])]
+    argv = [*DIE_WITH_PARENT, program, *options, *shared, *way, shlex.join(["sudo", "sh", "-c", script])]
     pipe = subprocess.PIPE
     with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True) as process:
         try:
@@ -175,16 +177,25 @@ class Services:
             (robot.name, task): State("not answered yet", False) for robot in asked for task in robot.control_tasks
         }
         """By robot and task, as they were reported last."""
+        self._sockets = tempfile.TemporaryDirectory(prefix="flotilla-")  # short: it holds sockets
         self.notes: dict[str, tuple[str, ...]] = {robot.name: () for robot in asked}
         """By robot, what else is to be said of it."""
         for robot in asked:
             ssh.command(robot)
             threading.Thread(target=self._follow, args=(robot,), daemon=True).start()
 
+    def way(self, robot: Robot) -> list[str]:
+        """The command line of ssh by the connection that is there, or a new one: nobody has to be let in first."""
+        program, *way = ssh.command(robot)
+        return [program, *self._shared(robot, "no"), *way]
+
+    def _shared(self, robot: Robot, master: str) -> list[str]:
+        return ["-o", f"ControlMaster={master}", "-o", f"ControlPath={self._sockets.name}/{robot.number}"]
+
     def _follow(self, robot: Robot) -> None:
         while True:
             try:
-                for answer in ask(robot):
+                for answer in ask(robot, self._shared(robot, "auto")):
                     for task, state in answer.tasks.items():
                         self.states[robot.name, task] = state
                     self.notes[robot.name] = answer.notes

@@ -4,6 +4,7 @@ nonsense."""
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import secrets
 import time
@@ -33,6 +34,13 @@ _BROKEN: dict[int | None, str] = {
     WSCloseCode.INVALID_TEXT: "text that is not UTF-8",
     WSCloseCode.MESSAGE_TOO_BIG: f"a request of more than {page_requests.LONGEST} bytes",
 }
+
+
+def _is_urgent(data: str | bytes) -> bool:
+    """Whether it asks for a stop, which is never limited."""
+    with contextlib.suppress(NoRequestError):
+        return len(data) < 64 and isinstance(page_requests.read(data), page_requests.StopAll)
+    return False
 
 
 class Session:
@@ -98,12 +106,12 @@ class Session:
         now_s = time.monotonic()
         self._allowance = min(_BURST, self._allowance + (now_s - self._since_s) * RATE_HZ)
         self._since_s = now_s
-        if self._allowance < 1:
+        if self._allowance < 1 and not _is_urgent(data):
             self.excess += 1
             if self.excess == 1:
                 self._note(f"{self.operator.name}: more than {RATE_HZ} requests a second; left out")
             return f"{self.excess} requests too many" if self.excess >= EXCESS else ""
-        self._allowance -= 1
+        self._allowance = max(0.0, self._allowance - 1)
         try:
             request = page_requests.read(data)
         except NoRequestError as error:

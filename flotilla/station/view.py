@@ -113,6 +113,14 @@ class View:
         self._followers[topic].append(follower)
         return follower
 
+    def task_stream(self, robot: str, task: str, signals: Iterable[str]) -> Stream | None:
+        """Of a task's streams, the one with all of these signals."""
+        wanted = set(signals)
+        for stream in self._known:
+            if (stream.robot, stream.task) == (robot, task) and wanted <= {each.name for each in stream.fields}:
+                return stream
+        return None
+
     def leave(self, follower: Follower) -> None:
         """It wants no more."""
         for followers in self._followers.values():

@@ -20,6 +20,7 @@ from flotilla.station.page_requests import LONGEST
 from flotilla.station.session import Session
 
 PAGE = Path(__file__).parent / "page"
+STOP_ALL = "/stop-all"
 BROWSERS = 16
 """At once."""
 _HEARTBEAT_S = 4.0
@@ -48,6 +49,7 @@ class Web:
         """Listen; the page's address, with the token."""
         app = web.Application(middlewares=[self._guard], client_max_size=LONGEST)
         app.router.add_get("/socket", self._socket)
+        app.router.add_post(STOP_ALL, self._stop_all)
         app.router.add_get("/{file:.*}", self._file)
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1)
         await self._runner.setup()
@@ -71,7 +73,7 @@ class Web:
                 request.headers,
                 request.cookies.get(self._access.cookie, ""),
                 request.query.get("token", ""),
-                socket=request.path == "/socket",
+                socket=request.path in ("/socket", STOP_ALL),
             )
         except RefusedError as error:
             self._note_refused(request, f"{error}")
@@ -101,6 +103,11 @@ class Web:
             charset="utf-8" if kind.startswith("text") else None,
             headers=headers,
         )
+
+    async def _stop_all(self, request: web.Request) -> web.StreamResponse:
+        """By a request of its own: never behind what a browser has sent before, and never limited. The answer says that
+        the station has it; what robots say of it comes to all browsers."""
+        return web.json_response({"robots": self._desk.stop_all(f"a browser at {request.remote}")}, headers=HEADERS)
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if len(self._sessions) >= BROWSERS:

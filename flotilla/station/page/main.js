@@ -95,10 +95,47 @@ $("record").onclick = () => {
   const on = !$("record").classList.contains("on");
   connection.ask({ do: "record", on }).catch((error) => toast(error.message));
 };
-$("stop-all").onclick = () => {
-  drive.rest();
-  if (!connection.send({ do: "stop-all" })) toast("No connection to the station: nothing was stopped.");
+// Stop all, by a request of its own, which waits behind nothing. Its answer says that the station has it; then each robot
+// acknowledges. What has not come back after a second is an alarm.
+const ACKNOWLEDGED_MS = 1000;
+let stopping = null; // { begun, robots: null or a map from a robot to whether it has acknowledged }
+$("stop-all").onclick = async () => {
+  const own = (stopping = { begun: performance.now(), robots: null, said: new Set(), late: false });
+  setTimeout(() => {
+    own.late = true;
+    showStop();
+  }, ACKNOWLEDGED_MS);
+  const asked = fetch("/stop-all", { method: "POST", cache: "no-store" });
+  drive?.rest();
+  showStop();
+  try {
+    const answer = await asked;
+    if (!answer.ok) throw new Error(`the station answers with status ${answer.status}`);
+    own.robots = (await answer.json()).robots;
+  } catch (error) {
+    own.failed = error.message;
+  }
+  showStop();
 };
+connection.on("stopped", ({ robot, acknowledged }) => {
+  if (!stopping || !acknowledged) return;
+  stopping.said.add(robot);
+  showStop();
+});
+
+function showStop() {
+  const { begun, robots, said, late, failed } = stopping;
+  const missing = robots?.filter((robot) => !said.has(robot)) ?? [];
+  const took = `${number((performance.now() - begun) / 1000, 1)} s`;
+  const [words, how] = failed || (late && !robots)
+    ? [`STOP ALL NOT ACKNOWLEDGED: ${failed ?? "the station does not answer"}`, "alarm"]
+    : missing.length
+      ? late ? [`STOP ALL NOT ACKNOWLEDGED by ${missing.join(", ")}`, "alarm"] : [`stopping: ${said.size} of ${robots.length}`, "warn"]
+      : robots ? [`stop all: ${robots.length} acknowledged after ${took}`, late ? "warn" : "good"] : ["stopping", "warn"];
+  $("stop-said").hidden = false;
+  $("stop-said").className = how === "alarm" ? "pill alarm" : `pill ${how}`;
+  text($("stop-said"), words);
+}
 
 let seeking = false;
 function showReplay({ s, playing, speed }) {
