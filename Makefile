@@ -325,8 +325,8 @@ convert: | setup-station ## make MCAP, CSV or MAT of recordings: make convert FI
 report: | setup-station ## a page of recordings: paths, commands, hops, latency: make report FILE=run.mcap|"log-*.rec" [OUT=page.html]
 	$(Q)$(FLOTILLA) report $(call option,--out,OUT) $(call need_each,FILE)
 
-param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5]]
-	$(Q)$(FLOTILLA) param $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
+param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5 [CONFIRM=old]]]
+	$(Q)$(FLOTILLA) param $(call option,--confirm,CONFIRM) $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
 
 scope: | setup ## signals of a task that runs: ROBOT=1 TASK=heading [SIGNALS="gyro.rate"] [EVERY= ROWS= TRIGGER='gyro.rate>0.1' BEFORE=] [CSV=file]
 	$(Q)$(FLOTILLA) scope $(call need,ROBOT) $(call option,--every,EVERY) $(call option,--rows,ROWS) $(call option,--trigger,TRIGGER) \

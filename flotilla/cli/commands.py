@@ -351,17 +351,30 @@ def _hwcheck_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _param(arguments: argparse.Namespace) -> None:
+    import sys
+
+    from flotilla.common.errors import UserError
     from flotilla.fleet import inventory
     from flotilla.robot import parameters
 
     robot = inventory.robot(inventory.load_fleet(), arguments.robot)
-    print(parameters.param(robot, arguments.task, arguments.parameter, arguments.value))
+    given = robot, arguments.task, arguments.parameter, arguments.value
+    try:
+        print(parameters.param(*given, arguments.confirm))
+    except UserError as error:
+        old = parameters.questioned(error)
+        if old is None or arguments.confirm is not None or not sys.stdin.isatty():
+            raise
+        if input(f"{error} [y/N] ").strip().lower() not in ("y", "yes"):
+            raise UserError("nothing was changed") from None
+        print(parameters.param(*given, old))
 
 
 def _param_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
     parser.add_argument("task", help="which runs on the robot")
     parser.add_argument("parameter", nargs="?", help="block.parameter; all by default")
+    parser.add_argument("--confirm", metavar="OLD", help="what a limit of safety is now; else you are asked")
     parser.add_argument("value", nargs="?", help="what to set it to; a negative one after --")
 
 

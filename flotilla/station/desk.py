@@ -364,7 +364,7 @@ class Desk:
         self._ask(
             session,
             request,
-            lambda robot: parameters.param(robot, request.task, request.parameter, request.value),
+            lambda robot: parameters.param(robot, request.task, request.parameter, request.value, request.confirm),
             told,
         )
 

@@ -43,6 +43,8 @@ class SetParameter(_OfTask):
     do: Literal["set"]
     parameter: Parameter
     value: Printable
+    confirm: Annotated[str, StringConstraints(pattern=r"^[^\s]{1,40}$")] | None = None
+    """What a limit of safety is now."""
 
 
 class Signals(_OfTask):

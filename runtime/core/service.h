@@ -18,6 +18,11 @@ struct fl_memory {
     struct fl_memory *next;
 };
 
+struct fl_bounds {
+    bool given; /* by the task file */
+    double least, greatest;
+};
+
 struct fl_service {
     struct fl_memory *memory;
     char failure[FL_FAILURE_BYTES];
@@ -29,6 +34,7 @@ struct fl_service {
     atomic_bool made_safe;          /* `safe` has returned */
     bool *wired;                    /* which inputs are */
     bool *given;                    /* which parameters the task file sets */
+    struct fl_bounds *bounds;       /* of each parameter while the task runs */
     int priority;                   /* SCHED_FIFO of the block's threads; 0: ordinary */
     int patience_ms;                /* how long to wait for a device that another process holds */
     int claim_fd;                   /* holds the block's device (device.h); below 1: none */

@@ -39,12 +39,13 @@ struct fl_block *block_create(const struct fl_block_type *type, const char *name
     block->parameters = place(block, type->parameters_size + 1);
     block->state = fl_allocate(block, type->state_size + 1);
     service->given = fl_allocate(block, type->parameter_count + 1);
+    service->bounds = fl_allocate(block, sizeof *service->bounds * (type->parameter_count + 1));
     int failed = 0;
     for (uint32_t i = 0; i < type->input_count; i++)
         failed |= fl_add_input(block, type->inputs[i]);
     for (uint32_t i = 0; i < type->output_count; i++)
         failed |= fl_add_output(block, type->outputs[i]);
-    if (!block->parameters || !block->state || !service->given || failed)
+    if (!block->parameters || !block->state || !service->given || !service->bounds || failed)
         abort();
     return block;
 }

@@ -353,3 +353,43 @@ void parameters_set(struct fl_block *block, const struct raw_value *raw, size_t 
         if (!parameter_find(type, raw[w].name, reason, sizeof reason))
             problem(problems, raw[w].line, "block %s: %s", block->name, reason);
 }
+
+double parameter_number(enum fl_kind kind, const void *place)
+{
+    switch (kind) {
+    case FL_KIND_INTEGER:
+        return (double)*(const int64_t *)place;
+    case FL_KIND_UNSIGNED:
+        return (double)*(const uint64_t *)place;
+    default:
+        return *(const double *)place;
+    }
+}
+
+static bool has_bounds(const struct fl_parameter *parameter)
+{
+    enum fl_kind kind = parameter->kind;
+    return parameter->flags & FL_TUNABLE &&
+           (kind == FL_KIND_DOUBLE || kind == FL_KIND_INTEGER || kind == FL_KIND_UNSIGNED);
+}
+
+void parameters_bound(struct fl_block *block, const struct raw_value *raw, size_t count, struct problems *problems)
+{
+    char reason[256];
+    for (size_t i = 0; i < count; i++) {
+        const struct fl_parameter *parameter = parameter_find(block->type, raw[i].name, reason, sizeof reason);
+        double least, greatest;
+        if (!parameter) {
+            problem(problems, raw[i].line, "block %s: bounds: %s", block->name, reason);
+        } else if (!has_bounds(parameter)) {
+            problem(problems, raw[i].line, "block %s: bounds: %s is no number that can be set while the task runs",
+                    block->name, parameter->name);
+        } else if (!raw[i].list || raw[i].count != 2 || !read_double(raw[i].text[0], &least) ||
+                   !read_double(raw[i].text[1], &greatest) || least > greatest) {
+            problem(problems, raw[i].line, "block %s: bounds: %s: is not a list of the least and the greatest value",
+                    block->name, parameter->name);
+        } else {
+            block->service->bounds[parameter - block->type->parameters] = (struct fl_bounds){true, least, greatest};
+        }
+    }
+}

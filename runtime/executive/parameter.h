@@ -34,6 +34,13 @@ size_t parameter_size(enum fl_kind kind);
 void parameters_set(struct fl_block *block, const struct raw_value *raw, size_t count, unsigned line,
                     struct problems *problems);
 
+/* Keep the bounds in `raw`, a list of the least and the greatest value for each, that parameters have while the task
+ * runs. */
+void parameters_bound(struct fl_block *block, const struct raw_value *raw, size_t count, struct problems *problems);
+
+/* The number of a parameter of a kind that has bounds: integers and doubles. */
+double parameter_number(enum fl_kind kind, const void *place);
+
 /* Numbers as task files write them: decimal or 0x…, with an optional unit of time for times. */
 bool read_integer(const char *text, int64_t *value);
 bool read_unsigned(const char *text, uint64_t *value);

@@ -53,6 +53,7 @@ static void make_block(struct building *building, struct registry *registry, con
     block->service->priority = building->task->priority ? building->task->priority - 1 : 0;
     block->service->registry = registry;
     parameters_set(block, entry->parameters, entry->parameter_count, entry->line, building->problems);
+    parameters_bound(block, entry->bounds, entry->bound_count, building->problems);
     if (building->problems->count == before && type->configure && type->configure(block) != FL_OK)
         problem(building->problems, entry->line, "block %s: %s", entry->name, block->service->failure);
     task_block->wrong = building->problems->count != before;

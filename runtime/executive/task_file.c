@@ -221,6 +221,11 @@ static void read_parameters(struct reading *reading, const yaml_node_t *value)
     reading->block->parameters = read_values(reading, value, "parameters", &reading->block->parameter_count);
 }
 
+static void read_bounds(struct reading *reading, const yaml_node_t *value)
+{
+    reading->block->bounds = read_values(reading, value, "bounds", &reading->block->bound_count);
+}
+
 static const struct key block_keys[] = {
     {.name = "type",
      .value = NAME,
@@ -236,6 +241,11 @@ static const struct key block_keys[] = {
      .otherwise = "defaults of the block",
      .then = read_parameters,
      .meaning = "by parameter: a value, or a list of values"},
+    {.name = "bounds",
+     .value = MAPPING,
+     .otherwise = "those of the block; a limit of safety stays as it is",
+     .then = read_bounds,
+     .meaning = "by tunable parameter: least and greatest value that it may be set to while the task runs"},
     {.name = "every",
      .value = INTEGER,
      .offset = offsetof(struct block_entry, every),

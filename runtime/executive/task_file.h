@@ -35,8 +35,8 @@ struct block_entry {
     const char *name, *type;
     unsigned line;
     int64_t every, offset;
-    struct raw_value *inputs, *parameters; /* an input's strings name its sources */
-    size_t input_count, parameter_count;
+    struct raw_value *inputs, *parameters, *bounds; /* an input's strings name its sources */
+    size_t input_count, parameter_count, bound_count;
 };
 
 struct task_file {

@@ -91,9 +91,17 @@ static const struct fl_parameter *find(const struct tuner *tuner, struct client 
     return parameter;
 }
 
-/* Only small values without memory of their own can be handed to the control thread. */
-static bool tunable(const struct fl_parameter *parameter)
+static const struct fl_bounds *bounds_of(const struct fl_block *block, const struct fl_parameter *parameter)
 {
+    return &block->service->bounds[parameter - block->type->parameters];
+}
+
+/* Only small values without memory of their own can be handed to the control thread. Limits of safety have to have
+ * bounds. */
+static bool tunable(const struct fl_block *block, const struct fl_parameter *parameter)
+{
+    if (parameter->flags & FL_SAFETY && !bounds_of(block, parameter)->given)
+        return false;
     enum fl_kind kind = parameter->kind;
     bool plain = kind == FL_KIND_BOOLEAN || kind == FL_KIND_INTEGER || kind == FL_KIND_UNSIGNED ||
                  kind == FL_KIND_DOUBLE || kind == FL_KIND_CHOICE;
@@ -106,14 +114,17 @@ static bool list(const struct tuner *tuner, struct client *client)
         const struct fl_block *block = tuner->task->blocks[i].block;
         for (uint32_t p = 0; p < block->type->parameter_count; p++) {
             const struct fl_parameter *parameter = &block->type->parameters[p];
-            bool unit = parameter->unit && *parameter->unit, limits = parameter->min != parameter->max;
+            const struct fl_bounds *bounds = bounds_of(block, parameter);
+            double least = bounds->given ? bounds->least : parameter->min;
+            double greatest = bounds->given ? bounds->greatest : parameter->max;
+            bool unit = parameter->unit && *parameter->unit, limits = least < greatest;
             fprintf(client->answer, "%s.%s: ", block->name, parameter->name);
             parameter_write(parameter, block->parameters, client->answer);
             fprintf(client->answer, "%s%s", unit ? " " : "", unit ? parameter->unit : "");
-            if (tunable(parameter))
+            if (tunable(block, parameter))
                 fprintf(client->answer, ", tunable");
-            if (tunable(parameter) && limits)
-                fprintf(client->answer, ", %g to %g", parameter->min, parameter->max);
+            if (tunable(block, parameter) && limits)
+                fprintf(client->answer, ", %g to %g", least, greatest);
             if (parameter->choices)
                 fprintf(client->answer, ", %s", parameter->choices);
             fputc('\n', client->answer);
@@ -187,7 +198,32 @@ static bool await_taken(struct tuner *tuner, struct client *client, uint64_t *st
     }
 }
 
-static bool set(struct tuner *tuner, struct client *client, char *name, const char *text)
+/* Refuse a value outside the bounds of the task file, and a limit of safety that nobody has confirmed. */
+static bool permitted(struct client *client, const struct fl_block *block, const struct fl_parameter *parameter,
+                      const void *value, const char *text, const char *confirmed)
+{
+    const struct fl_bounds *bounds = bounds_of(block, parameter);
+    double wanted = bounds->given ? parameter_number(parameter->kind, value) : 0;
+    if (bounds->given && (wanted < bounds->least || wanted > bounds->greatest))
+        return refuse(client, "block %s: parameter %s: %s is outside %g to %g, its bounds in the task file",
+                      block->name, parameter->name, text, bounds->least, bounds->greatest);
+    if (!(parameter->flags & FL_SAFETY))
+        return true;
+    char *old = NULL;
+    size_t length = 0;
+    FILE *out = open_memstream(&old, &length);
+    if (!out)
+        abort();
+    parameter_write(parameter, block->parameters, out);
+    fclose(out);
+    bool good = confirmed && strcmp(confirmed, old) == 0;
+    if (!good)
+        refuse(client, "%s.%s is a limit of safety: %s → %s; confirm it", block->name, parameter->name, old, text);
+    free(old);
+    return good;
+}
+
+static bool set(struct tuner *tuner, struct client *client, char *name, const char *text, const char *confirmed)
 {
     unsigned char value[CHANGE_BYTES];
     uint64_t step;
@@ -195,9 +231,12 @@ static bool set(struct tuner *tuner, struct client *client, char *name, const ch
     const struct fl_parameter *parameter = find(tuner, client, name, &block);
     if (!parameter)
         return false;
-    if (!tunable(parameter))
+    if (parameter->flags & FL_SAFETY && !tunable(block, parameter))
+        return refuse(client, "block %s: parameter %s is a limit of safety, and the task file gives it no bounds",
+                      block->name, parameter->name);
+    if (!tunable(block, parameter))
         return refuse(client, "block %s: parameter %s cannot be set while the task runs", block->name, parameter->name);
-    if (!judge(client, block, parameter, text, value))
+    if (!judge(client, block, parameter, text, value) || !permitted(client, block, parameter, value, text, confirmed))
         return false;
     fprintf(client->answer, "%s.%s: ", block->name, parameter->name);
     parameter_write(parameter, block->parameters, client->answer);
@@ -238,12 +277,16 @@ static bool obey(struct tuner *tuner, struct client *client)
     if (strcmp(verb, "get") == 0 && name && !rest)
         return get(tuner, client, name);
     if (strcmp(verb, "set") == 0 && name && rest)
-        return set(tuner, client, name, rest);
+        return set(tuner, client, name, rest, NULL);
+    char *old = strcmp(verb, "confirm") == 0 ? strsep(&rest, " ") : NULL;
+    if (name && old && rest)
+        return set(tuner, client, name, rest, old);
     if (strcmp(verb, "signals") == 0 && !name)
         return list_signals(tuner, client);
     if (strcmp(verb, "status") == 0 && (!name || (strcmp(name, "json") == 0 && !rest)))
         return send_status(tuner, client, name);
-    return refuse(client, "unknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, "
+    return refuse(client, "unknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, confirm "
+                          "BLOCK.PARAMETER OLD VALUE, status, "
                           "status json, signals, watch SIGNAL...");
 }
 
@@ -257,7 +300,7 @@ static void serve_client(struct tuner *tuner, struct client *client)
     if (!client->answer)
         return;
     if (client_receive(tuner->stop_fd, client->fd, client->request, sizeof client->request)) {
-        bool setting = strncmp(client->request, "set", 3) == 0;
+        bool setting = strncmp(client->request, "set", 3) == 0 || strncmp(client->request, "confirm", 7) == 0;
         fputs("ok\n", client->answer);
         bool done = obey(tuner, client);
         fflush(client->answer);

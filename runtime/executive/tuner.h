@@ -6,6 +6,7 @@
  *     list                           all parameters
  *     get BLOCK.PARAMETER
  *     set BLOCK.PARAMETER VALUE      as a task file has it; only tunable parameters (FL_TUNABLE)
+ *     confirm BLOCK.PARAMETER OLD VALUE   of a limit of safety (FL_SAFETY) that is OLD now; `set` refuses it
  *     status                         steps, overruns, flags of sensors: lines for people
  *     status json                    the same, as status.h describes it
  *     signals                        all outputs of blocks, a line each: BLOCK.PORT TYPE ELEMENTS [UNIT]

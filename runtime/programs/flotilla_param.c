@@ -17,6 +17,7 @@ static const char usage[] =
     "usage: flotilla-param [OPTION]... TASK [BLOCK.PARAMETER [VALUE]]\n"
     "List the parameters of a task that runs here, or of an app's, print one of them, or set it between two steps.\n"
     "\n"
+    "  --confirm OLD   set a limit of safety, which is OLD now; without this it is refused with both values\n"
     "  --status[=json] how the task does instead: steps, overruns, flags and ages of its sensors\n"
     "  --control PATH  the task's socket (default: control in /run/flotilla/TASK or\n"
     "                  /run/flotilla-apps/TASK, whichever is there)\n"
@@ -25,14 +26,12 @@ static const char usage[] =
     "Status: 0 done, 1 refused, or no such task runs, 2 the command line is wrong.\n";
 
 enum { ANSWER_MS = 30 * 1000 };
-enum { CONTROL = 1, STATUS, HELP, VERSION };
+enum { CONTROL = 1, CONFIRM, STATUS, HELP, VERSION };
 
 static const struct option options[] = {
-    {"control", required_argument, NULL, CONTROL},
-    {"status", optional_argument, NULL, STATUS},
-    {"help", no_argument, NULL, HELP},
-    {"version", no_argument, NULL, VERSION},
-    {0},
+    {"control", required_argument, NULL, CONTROL}, {"confirm", required_argument, NULL, CONFIRM},
+    {"status", optional_argument, NULL, STATUS},   {"help", no_argument, NULL, HELP},
+    {"version", no_argument, NULL, VERSION},       {0},
 };
 
 /* Read until the other end closes; NULL on time-out. To be freed. */
@@ -75,15 +74,16 @@ static int ask(const char *task, const char *path, const char *request, size_t l
 }
 
 /* The request as tuner.h has it; false when a word would break its line. */
-static bool write_request(char **request, size_t *length, const char *verb, char **words, int count)
+static bool write_request(char **request, size_t *length, const char *verb, const char *old, char **words, int count)
 {
     FILE *out = open_memstream(request, length);
     if (!out)
         abort();
     fputs(verb, out);
     for (int i = 0; i < count; i++)
-        fprintf(out, " %s", words[i]);
-    bool good = (count == 0 || !strpbrk(words[0], " \n")) && (count < 2 || !strchr(words[1], '\n'));
+        fprintf(out, "%s%s %s", i == 1 && old ? " " : "", i == 1 && old ? old : "", words[i]);
+    bool good = (!old || (count == 2 && !strpbrk(old, " \n"))) && (count == 0 || !strpbrk(words[0], " \n")) &&
+                (count < 2 || !strchr(words[1], '\n'));
     fputc('\n', out);
     return fclose(out) == 0 && good;
 }
@@ -91,13 +91,16 @@ static bool write_request(char **request, size_t *length, const char *verb, char
 int main(int argc, char **argv)
 {
     static const char *const verbs[] = {"list", "get", "set"}; /* by the number of words */
-    const char *path = NULL, *status = NULL;
+    const char *path = NULL, *status = NULL, *old = NULL;
     char usual[PATH_MAX], *request;
     size_t length;
     for (int option; (option = getopt_long(argc, argv, "+", options, NULL)) != -1;) { /* a value may begin with - */
         switch (option) {
         case CONTROL:
             path = optarg;
+            break;
+        case CONFIRM:
+            old = optarg;
             break;
         case STATUS:
             status = !optarg ? "status" : strcmp(optarg, "json") == 0 ? "status json" : NULL;
@@ -118,7 +121,11 @@ int main(int argc, char **argv)
     }
     int words = argc - optind;
     if (words < 1 || words > (status ? 1 : 3) || strchr(argv[optind], '/') ||
-        !write_request(&request, &length, status ? status : verbs[words - 1], argv + optind + 1, words - 1)) {
+        !write_request(&request, &length,
+                       status ? status
+                       : old  ? "confirm"
+                              : verbs[words - 1],
+                       old, argv + optind + 1, words - 1)) {
         fputs(usage, stderr);
         return 2;
     }

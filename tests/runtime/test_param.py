@@ -232,7 +232,7 @@ def test_a_wrong_request_is_answered(start: Start, request_: bytes) -> None:
     with start().connected() as client:
         client.sendall(request_)
         assert client.makefile().read() == (
-            "error\nunknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, status, "
+            "error\nunknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, confirm BLOCK.PARAMETER OLD VALUE, status, "
             "status json, signals, watch SIGNAL...\n"
         )
 
@@ -351,3 +351,64 @@ def test_a_wrong_wish_for_status_is_said(start: Start) -> None:
     assert (refused.returncode, refused.stdout) == (2, "")
     assert refused.stderr == "flotilla-param: --status=xml: there is --status and --status=json\n"
     assert running.status("--status", "other").returncode == 2
+
+
+LIMITED = """
+  speed: {type: limit, in: {in: a.out}, parameters: {min: 0, max: 0.5}, bounds: {max: [0, 0.8]}}
+  turn: {type: limit, in: {in: a.out}, parameters: {min: 0, max: 0.5}}
+"""
+
+
+def test_limits_of_safety_are_set_within_bounds_and_confirmed(flotilla_run: Path, tmp_path: Path) -> None:
+    """Seen to fail: `v_limit.max` took 1e9 in one keystroke, on a robot that drove."""
+    running = Running(flotilla_run, tmp_path, more=LIMITED)
+    try:
+        listed = running.param().stdout
+        assert "speed.max: 0.5, tunable, 0 to 0.8\n" in listed
+        assert "turn.max: 0.5\n" in listed
+        for words, said in (
+            (("speed.max", "0.7"), "speed.max is a limit of safety: 0.5 → 0.7; confirm it"),
+            (("--confirm", "0.4", "task", "speed.max", "0.7"), "0.5 → 0.7; confirm it"),
+            (("speed.max", "1e9"), "block speed: parameter max: 1e9 is outside 0 to 0.8, its bounds in the task file"),
+            (("--confirm", "0.5", "task", "speed.max", "1e9"), "1e9 is outside 0 to 0.8"),
+            (
+                ("turn.max", "0.4"),
+                "block turn: parameter max is a limit of safety, and the task file gives it no bounds",
+            ),
+        ):
+            refused = asked(running, words)
+            assert (refused.returncode, said in refused.stderr) == (1, True), refused.stderr
+        assert running.param("speed.max").stdout == "0.5\n"
+        done = asked(running, ("--confirm", "0.5", "task", "speed.max", "0.7"))
+        assert done.returncode == 0, done.stderr
+        assert "speed.max: 0.5 → 0.7 from step" in done.stdout
+        assert running.param("speed.max").stdout == "0.7\n"
+    finally:
+        running.process.send_signal(signal.SIGTERM)
+        _, logged = running.process.communicate(timeout=SECONDS)
+    assert re.search(rf"^flotilla: \S+: user {os.getuid()}: speed\.max: 0\.5 → 0\.7 from step", logged, re.M)
+
+
+def asked(running: Running, words: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
+    """Of flotilla-param; `--confirm` comes before the task."""
+    if words[0] != "--confirm":
+        return running.param(*words)
+    argv = [str(running.program.with_name("flotilla-param")), "--control", str(running.control), *words]
+    return subprocess.run(argv, capture_output=True, text=True, timeout=SECONDS, check=False)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "said"),
+    [
+        ("{top: [0, 1]}", "block speed: bounds: limit has no parameter top"),
+        ("{initial: [0, 1]}", "block speed: bounds: initial is no number that can be set while the task runs"),
+        ("{max: [1, 0]}", "block speed: bounds: max: is not a list of the least and the greatest value"),
+        ("{max: 1}", "block speed: bounds: max: is not a list of the least and the greatest value"),
+    ],
+)
+def test_bounds_that_are_none(flotilla_run: Path, tmp_path: Path, bounds: str, said: str) -> None:
+    file = tmp_path / "task.yml"
+    more = f"  speed: {{type: limit, in: {{in: a.out}}, parameters: {{min: 0, max: 0.5}}, bounds: {bounds}}}"
+    file.write_text(TASK.format(**USUAL | {"more": more}))
+    done = subprocess.run([flotilla_run, "--check", file], capture_output=True, text=True, check=False)
+    assert (done.returncode, said in done.stderr) == (2, True), done.stderr

@@ -53,7 +53,7 @@ GIVEN = {
     "fetch": ["ROBOT", "TASK", "OUT"],
     "convert": ["OUT", "TOPIC"],
     "report": ["OUT"],
-    "param": ["ROBOT", "TASK", "PARAM", "VALUE"],
+    "param": ["ROBOT", "TASK", "PARAM", "VALUE", "CONFIRM"],
     "scope": ["ROBOT", "TASK", "EVERY", "ROWS", "TRIGGER", "BEFORE", "CSV"],
     "latency": ["BOARD", "KERNEL", "PLAN", "TARGET"],
     "latency-accept": ["BOARD", "KERNEL", "PLAN"],

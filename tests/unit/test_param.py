@@ -83,3 +83,15 @@ def test_the_robot_is_that_of_the_inventory_that_was_given(tmp_path: Path, words
     environment["INVENTORY"] = "/nowhere"
     done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, "INVENTORY=/nowhere: there is no such directory" in done.stderr) == (1, True)
+
+
+def test_a_limit_of_safety_is_asked_for_and_confirmed(robot: Path) -> None:
+    program(
+        robot, 'echo "flotilla-param: task drive: v_limit.max is a limit of safety: 0.5 → 0.6; confirm it" >&2; exit 1'
+    )
+    with pytest.raises(UserError) as refused:
+        parameters.param(ROBOT, "drive", "v_limit.max", "0.6")
+    assert parameters.questioned(refused.value) == "0.5"
+    assert parameters.questioned(UserError("robot3: no task heading runs here")) is None
+    program(robot, 'echo "$*"')
+    assert parameters.param(ROBOT, "drive", "v_limit.max", "0.6", "0.5") == "--confirm 0.5 drive v_limit.max 0.6"

@@ -129,7 +129,12 @@ export class Tasks {
       field.onchange = async () => {
         field.disabled = true;
         try {
-          const answer = await this.connection.ask({ do: "set", robot, task, parameter: name, value: field.value });
+          const wanted = { do: "set", robot, task, parameter: name, value: field.value };
+          const answer = await this.connection.ask(wanted).catch((error) => {
+            const asked = error.message.match(/is a limit of safety: (\S+) → .*; confirm it/);
+            if (!asked || !confirm(error.message)) throw error;
+            return this.connection.ask({ ...wanted, confirm: asked[1] });
+          });
           before = field.value;
           toast(`${name}: ${answer}`, true);
         } catch (error) {

@@ -29,10 +29,10 @@ struct guard {
 
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct guard, length, .min = 8, .max = 65507, .unit = "B", .summary = "bytes of a datagram"),
-    FL_PARAMETER(struct guard, apart, .flags = FL_TUNABLE, .default_value = "1", .min = 1e-3, .max = 3600, .unit = "s",
-                 .summary = "an operator that is silent for longer does not speak any more"),
-    FL_PARAMETER(struct guard, timeout, .flags = FL_TUNABLE, .default_value = "0.3", .min = 1e-3, .max = 3600,
-                 .unit = "s", .summary = "older commands are none"),
+    FL_PARAMETER(struct guard, apart, .flags = FL_TUNABLE | FL_SAFETY, .default_value = "1", .min = 1e-3, .max = 3600,
+                 .unit = "s", .summary = "an operator that is silent for longer does not speak any more"),
+    FL_PARAMETER(struct guard, timeout, .flags = FL_TUNABLE | FL_SAFETY, .default_value = "0.3", .min = 1e-3,
+                 .max = 3600, .unit = "s", .summary = "older commands are none"),
 };
 
 enum { IN_FLAG, IN_AGE, IN_SEQUENCE, IN_DATA };

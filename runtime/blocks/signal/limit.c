@@ -18,10 +18,10 @@ struct limit {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct limit, min, .flags = FL_TUNABLE, .summary = "least output"),
-    FL_PARAMETER(struct limit, max, .flags = FL_TUNABLE, .summary = "greatest output"),
-    FL_PARAMETER(struct limit, rate, .flags = FL_TUNABLE, .default_value = "0", .max = INFINITY, .unit = "1/s",
-                 .summary = "fastest change of the output, either way; 0: any"),
+    FL_PARAMETER(struct limit, min, .flags = FL_TUNABLE | FL_SAFETY, .summary = "least output"),
+    FL_PARAMETER(struct limit, max, .flags = FL_TUNABLE | FL_SAFETY, .summary = "greatest output"),
+    FL_PARAMETER(struct limit, rate, .flags = FL_TUNABLE | FL_SAFETY, .default_value = "0", .max = INFINITY,
+                 .unit = "1/s", .summary = "fastest change of the output, either way; 0: any"),
     FL_PARAMETER(struct limit, initial, .default_value = "0",
                  .summary = "output at time zero, from where the first change is limited"),
 };

@@ -25,16 +25,16 @@ struct stop {
 static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct stop, curvatures, .default_value = "0", .min = -1e3, .max = 1e3, .unit = "1/m",
                  .summary = "of the curves whose clearances come in, increasing; positive: to the left"),
-    FL_PARAMETER(struct stop, deceleration, .flags = FL_TUNABLE, .min = 1e-3, .max = 100, .unit = "m/s²",
+    FL_PARAMETER(struct stop, deceleration, .flags = FL_TUNABLE | FL_SAFETY, .min = 1e-3, .max = 100, .unit = "m/s²",
                  .summary = "with which the robot surely stops: less than the limit that follows this block"),
-    FL_PARAMETER(struct stop, delay, .flags = FL_TUNABLE, .max = 10, .unit = "s",
+    FL_PARAMETER(struct stop, delay, .flags = FL_TUNABLE | FL_SAFETY, .max = 10, .unit = "s",
                  .summary = "from this block's output to the wheels, and until newer clearances come"),
-    FL_PARAMETER(struct stop, margin, .flags = FL_TUNABLE, .max = 100, .unit = "m",
+    FL_PARAMETER(struct stop, margin, .flags = FL_TUNABLE | FL_SAFETY, .max = 100, .unit = "m",
                  .summary = "that is left when the robot has stopped"),
-    FL_PARAMETER(struct stop, backward, .flags = FL_TUNABLE, .default_value = "0", .max = 100, .unit = "m/s",
-                 .summary = "greatest speed back, where nothing is seen"),
-    FL_PARAMETER(struct stop, timeout, .flags = FL_TUNABLE, .default_value = "0.3", .min = 1e-3, .max = 10, .unit = "s",
-                 .summary = "older clearances are none"),
+    FL_PARAMETER(struct stop, backward, .flags = FL_TUNABLE | FL_SAFETY, .default_value = "0", .max = 100,
+                 .unit = "m/s", .summary = "greatest speed back, where nothing is seen"),
+    FL_PARAMETER(struct stop, timeout, .flags = FL_TUNABLE | FL_SAFETY, .default_value = "0.3", .min = 1e-3, .max = 10,
+                 .unit = "s", .summary = "older clearances are none"),
 };
 
 enum { V, OMEGA, SPEED, RATE, FLAG, AGE, SEQUENCE, CLEARANCE };

@@ -109,6 +109,10 @@ enum {
        no step of the task has ended for this long, and for at least five periods, the task is ended with outputs safe
      */
     FL_ACTUATOR_TIMEOUT = 1u << 2,
+    /* a number that limits what an actuator may do: a greatest speed, a margin, a time-out. With FL_TUNABLE: it is set
+       while the task runs only within the bounds that the task file gives it, and only by who confirms the old and the
+       new value */
+    FL_SAFETY = 1u << 3,
 };
 
 struct fl_parameter {
