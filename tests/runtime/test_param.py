@@ -232,7 +232,8 @@ def test_a_wrong_request_is_answered(start: Start, request_: bytes) -> None:
     with start().connected() as client:
         client.sendall(request_)
         assert client.makefile().read() == (
-            "error\nunknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, confirm BLOCK.PARAMETER OLD VALUE, status, "
+            "error\nunknown request; known are list, get BLOCK.PARAMETER, set BLOCK.PARAMETER VALUE, confirm "
+            "BLOCK.PARAMETER OLD VALUE, status, "
             "status json, signals, watch SIGNAL...\n"
         )
 
