@@ -95,8 +95,8 @@ static void what_was_put_is_written(void **state)
     assert_non_null(strstr(line, "{\"task\": \"heading\", \"period_s\": 0.01, \"running_s\": 0."));
     assert_non_null(
         strstr(line, "\"steps\": 1, \"overruns\": 0, \"skipped\": 0, \"timeouts\": 4, \"last_overrun\": null"));
-    assert_non_null(
-        strstr(line, "\"sensors\": {\"gyro\": {\"flag\": false, \"age_s\": 0.250000}}, \"refused\": {}}\n"));
+    assert_non_null(strstr(
+        line, "\"sensors\": {\"gyro\": {\"flag\": false, \"age_s\": 0.250000}}, \"refused\": {}, \"waiting\": []}\n"));
 
     result = (struct run_result){.steps = 9, .overruns = 2, .skipped = 3, .last_overrun = {7, fl_now_ns(), 1500000}};
     set_sensor(true, 0.004);
@@ -138,14 +138,15 @@ static void what_was_refused_is_named(void **state)
     set_sensor(true, 0);
     set_refused(WRENCH, 0, 0);
     set_refused(STATE, 0, 0);
-    check_refused(status, "}, \"refused\": {}}\n", "");
+    check_refused(status, "}, \"refused\": {}, \"waiting\": []}\n", "");
     set_refused(STATE, 0, 410);
-    check_refused(status, "}, \"refused\": {\"state\": {\"forged\": 410}}}\n", "refused by state: 410 forged\n");
+    check_refused(status, "}, \"refused\": {\"state\": {\"forged\": 410}}, \"waiting\": []}\n",
+                  "refused by state: 410 forged\n");
     set_refused(WRENCH, 5, UINT32_MAX);
-    check_refused(
-        status,
-        "}, \"refused\": {\"wrench\": {\"refused\": 5, \"forged\": 4294967295}, \"state\": {\"forged\": 410}}}\n",
-        "refused by wrench: 5 refused, 4294967295 forged\nrefused by state: 410 forged\n");
+    check_refused(status,
+                  "}, \"refused\": {\"wrench\": {\"refused\": 5, \"forged\": 4294967295}, \"state\": {\"forged\": "
+                  "410}}, \"waiting\": []}\n",
+                  "refused by wrench: 5 refused, 4294967295 forged\nrefused by state: 410 forged\n");
     status_destroy(status);
 }
 
