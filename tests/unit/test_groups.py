@@ -189,7 +189,7 @@ def without(tmp_path: Path, module: str, *words: str) -> subprocess.CompletedPro
 
 
 def test_a_command_without_its_packages_says_what_installs_them(tmp_path: Path) -> None:
-    """Seen to fail: a traceback that ends with `No module named 'rich'`."""
+    """Seen to fail in an environment of the group `build`: tracebacks, of numpy for `top` and of rich for `drive`."""
     done = without(tmp_path, "rich", "top", "--help")
     assert (done.returncode, done.stderr) == (
         1, "error: flotilla top: the Python package rich is not installed; `make setup-station` installs it\n"

@@ -394,7 +394,7 @@ def locks(*names: str) -> list[str]:
 
 
 def test_a_group_is_added_to_what_is_there(tmp_path: Path) -> None:
-    """Seen to fail: every command installed all packages."""
+    """And nothing of it is installed once more."""
     venv = with_groups(tmp_path, "build")
     assert setup(tmp_path).returncode == 0
     assert installs(tmp_path) == []
