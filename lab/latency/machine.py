@@ -35,6 +35,8 @@ _PROGRAMS = {"i386": "usr/libexec/qemu-system-i386", "x86_64": "usr/bin/qemu-sys
 
 
 CONSOLE = "console.log"
+RELAYS = ("-chardev", "null,id=relays", "-device", "isa-parallel,iobase=0x300,chardev=relays")
+"""What can be written and read back at the relay board's first register: a printer port's data register."""
 """Where in a run's directory the guest's console stays."""
 _ISA = ("ttyS0", "ttyS1", "ttyS2", "ttyS3")
 

@@ -171,7 +171,8 @@ def run(board: Board, out: Path) -> dict[str, str]:
         measured, initrd, {"scenarios": [], "commands": commands},
         {str(DIRECTORY / name): content for name, content in files.items()},
     )  # fmt: skip
-    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=CAN_BOARDS)
+    extra = (*CAN_BOARDS, *machine.RELAYS)
+    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=extra)
     document = results.received(guest.run(out, 600))
     initrd.unlink()
     outputs: dict[str, str] = document["commands"]

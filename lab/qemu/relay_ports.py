@@ -30,10 +30,10 @@ def drive_inputs(machine: Guest, board: Ir104) -> None:
 class RelayPorts:
     """The relay registers' I/O ports: what the guest writes to them moves the relays of `board`.
 
-    It reads `read_back` from them, whatever it wrote.
+    It reads `read_back` from them, whatever it wrote: all relays off, so that a task which ends finds them reset.
     """
 
-    def __init__(self, board: Ir104, read_back: Sequence[int] = (0xE9,) * REGISTERS) -> None:
+    def __init__(self, board: Ir104, read_back: Sequence[int] = (0,) * REGISTERS) -> None:
         self.board = board
         self._read_back = read_back
         self._listeners = [socket.create_server(("127.0.0.1", 0)) for _ in range(REGISTERS)]

@@ -35,7 +35,7 @@ from lab.qemu import qemu
 from lab.scenarios import guests as realtime
 from lab.scenarios import virtual
 from lab.scenarios.flight import Flight
-from lab.scenarios.virtual import DIRECTORY, PLANT, RATE_MBIT_S, RELAYS, STATION, Plan
+from lab.scenarios.virtual import DIRECTORY, PLANT, RATE_MBIT_S, STATION, Plan
 
 HERE = Path(__file__).parent
 DEFAULT = "air"
@@ -167,7 +167,7 @@ def _running(
     subject.write_initrd(system, initrd, {"scenarios": [], "commands": commands}, member.files, member.nodes)
     extra = _shared_memory(box, out / "barrier.so", qemu.port_ids(board)[_bell(board)])
     if len(member.radios) > 1:
-        extra += RELAYS
+        extra += machine.RELAYS
     guest = machine.Machine(emulator, board, system.kernel, initrd, system.arguments(), extra=extra)
     argv = guest.command_line(directory / machine.CONSOLE, directory / "results")
     try:

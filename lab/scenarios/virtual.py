@@ -42,8 +42,6 @@ STANDBY = "-standby"
 """After the name of a task that stands by for another's."""
 STRANGER = "stranger"
 """A computer in the cell that is not of the fleet."""
-RELAYS = ("-chardev", "null,id=relays", "-device", "isa-parallel,iobase=0x300,chardev=relays")
-"""What can be written and read back at the relay board's first register: a printer port's data register."""
 IGPS_BYTES = 16
 """Of a position's datagram."""
 MEMORY_MIB = 768
@@ -367,7 +365,7 @@ def run(there: Mapping[str, bytes], board: Board, out: Path, flights: Mapping[st
     commands = {"session": ["python3", f"{DIRECTORY}/fly.py", f"{DIRECTORY}/session.json"]}
     subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, dict(there))
     guest = machine.Machine(
-        machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=RELAYS, shift=shift
+        machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=machine.RELAYS, shift=shift
     )
     console = out / machine.CONSOLE
     console.unlink(missing_ok=True)  # of an earlier run

@@ -222,7 +222,8 @@ def stage(board: Board, kbit_s: int, out: Path) -> Staged:
     commands = {"session": ["python3", f"{DIRECTORY}/guest.py", f"{DIRECTORY}/session.json"]}
     subject.write_initrd(measured, initrd, {"scenarios": [], "commands": commands}, files)
     board = board.model_copy(update={"qemu": board.qemu.model_copy(update={"memory_mib": MEMORY_MIB})})
-    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments())
+    extra = machine.RELAYS
+    guest = machine.Machine(machine.emulator(), board, measured.kernel, initrd, measured.arguments(), extra=extra)
     with progress.step("an update while control runs"):
         document = results.received(guest.run(out, _HOST_S))
     initrd.unlink()
