@@ -24,7 +24,6 @@ def verify(*options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(argv, cwd=paths.PROJECT, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.nightly  # a whole build
 def test_second_build_elsewhere_is_identical() -> None:
     KEPT.touch()  # as an earlier run left it
     done = verify()
