@@ -10,7 +10,6 @@ import hashlib
 import itertools
 import re
 import subprocess
-import time
 from pathlib import Path
 
 from flotilla.common import cache
@@ -45,7 +44,7 @@ def start(guest: Guest, *, cold: bool = False) -> None:
 def wait(guest: Guest, robot: Robot, shell: Ssh) -> None:
     """Until a guest that was started has booted, and SSH is connected. The first one like it is saved."""
     if guest.restored:
-        shell.script(f"date --set=@{time.time()}")
+        shell.script("date --set=@$(cat /sys/class/rtc/rtc0/since_epoch)")
         return
     await_login(guest, robot)
     shell.connect()
