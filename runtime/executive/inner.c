@@ -256,21 +256,7 @@ void fl_inner_start(struct fl_inner *inner, const char *ports)
         fail(inner, type->name, block->service->failure);
 }
 
-/* Of a parameter's C type. */
-static double number(const struct fl_parameter *parameter, const void *place)
-{
-    switch (parameter->kind) {
-    case FL_KIND_BOOLEAN:
-        return *(const bool *)place;
-    case FL_KIND_INTEGER:
-        return (double)*(const int64_t *)place;
-    case FL_KIND_UNSIGNED:
-        return (double)*(const uint64_t *)place;
-    default:
-        return *(const double *)place;
-    }
-}
-
+/* By the parameter's C type. */
 static void put(const struct fl_parameter *parameter, void *place, double value)
 {
     switch (parameter->kind) {
@@ -310,7 +296,7 @@ void fl_inner_tune(struct fl_inner *inner, const double *values)
     for (size_t i = 0; i < inner->tunable_count; i++) {
         const struct fl_parameter *parameter = inner->tuned[i];
         void *place = (char *)(uintptr_t)inner->block->parameters + parameter->offset;
-        double present = number(parameter, place);
+        double present = parameter_number(parameter->kind, place);
         if (!(values[i] < present) && !(values[i] > present) && !isnan(values[i]))
             continue;
         if (allowed(parameter, values[i])) {

@@ -357,6 +357,8 @@ void parameters_set(struct fl_block *block, const struct raw_value *raw, size_t 
 double parameter_number(enum fl_kind kind, const void *place)
 {
     switch (kind) {
+    case FL_KIND_BOOLEAN:
+        return *(const bool *)place;
     case FL_KIND_INTEGER:
         return (double)*(const int64_t *)place;
     case FL_KIND_UNSIGNED:

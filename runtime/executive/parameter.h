@@ -38,7 +38,7 @@ void parameters_set(struct fl_block *block, const struct raw_value *raw, size_t 
  * runs. */
 void parameters_bound(struct fl_block *block, const struct raw_value *raw, size_t count, struct problems *problems);
 
-/* The number of a parameter of a kind that has bounds: integers and doubles. */
+/* The value of a parameter as a number; its kind is boolean, an integer or double. */
 double parameter_number(enum fl_kind kind, const void *place);
 
 /* Numbers as task files write them: decimal or 0x…, with an optional unit of time for times. */
