@@ -101,7 +101,10 @@ def compile_shared(
     """A C file, or some of a directory, as a shared object for robots of an architecture.
 
     `files` and paths in `options` are relative to that directory; so are `others`, which have options of their own.
+    A name that the compiler would take for an option raises UserError.
     """
+    if options_alike := [name for name in (*files, *others) if name.startswith("-")]:
+        raise UserError(f"{options_alike[0]}: the name begins with a hyphen, as the compiler's options do; rename it")
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".plugin-") as directory:
         work = Path(directory)
         if source.is_dir():

@@ -158,3 +158,10 @@ def test_a_folder_of_foreign_code_alone_has_no_block(source: Path) -> None:
     (source / "block.c").unlink()
     assert runtime.compile_plugin(source, HOST)[:4] == b"\x7fELF"
     shutil.rmtree(source)
+
+
+def test_a_file_named_like_an_option_is_refused(tmp_path: Path) -> None:
+    """Seen to fail: gcc took the name for an option of its own."""
+    (tmp_path / "-wrapper,touch.c").write_text("int unused;\n")
+    with pytest.raises(UserError, match=r"-wrapper,touch\.c: the name begins with a hyphen"):
+        runtime.compile_plugin(tmp_path, HOST)

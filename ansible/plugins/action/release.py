@@ -195,14 +195,14 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         return {"changed": True, "told": self._update("activate")}
 
     def _confirm(self) -> dict[str, Any]:
-        return {"changed": True, "told": self._run("flotilla-slot confirm")}
+        return {"changed": True, "told": answers.shown(self._run("flotilla-slot confirm"))}
 
     def _back(self) -> dict[str, Any]:
         state = answers.judged(self._name, _parsed(self._run("flotilla-slot show")), answers.Release)
         other = "B" if state["running"] == "A" else "A"
         if not state["slots"][other]["ok"]:
             raise AnsibleActionFail(f"slot {other} holds no release that worked: there is nothing to go back to")
-        return {"changed": True, "told": self._run(f"flotilla-slot trial {other}")}
+        return {"changed": True, "told": answers.shown(self._run(f"flotilla-slot trial {other}"))}
 
     # --- what they have in common ---
 
