@@ -300,7 +300,7 @@ station: | setup-station ## a page to see the fleet, drive, tune and record it [
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
 station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)
-record: | setup-station ## what robots tell this station, as an MCAP file for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS= INVENTORY=]
+record: | setup-station ## record telemetry to an MCAP file, for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS= INVENTORY=]
 	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
 
 live: | setup-station ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file

@@ -348,7 +348,7 @@ def explained(error: UserError, system: System) -> UserError:
     if missing := _MISSING.search(str(error)):
         header = missing[1]
         reason = _ABSENT.get(Path(header).name) or next(why for names, why in _UNKNOWN if names.search(header))
-        return UserError(f"{GENERATED}/ lacks {header}: it is {reason}")
+        return UserError(f"{GENERATED}/{header} is missing: it is {reason}")
     if size := _WORD_SIZE.search(str(error)):
         remedy = "choose the robot's processor (x86-32 or x86-64, Linux) as hardware implementation"
         return UserError(

@@ -505,7 +505,7 @@ def _check(unit: Unit, place: Path, system: System, run: toolchain.Run) -> None:
             lacking = sorted(set(_LACKING.findall(str(error))))
             what = ", ".join(" ".join(filter(None, each)) for each in lacking) or str(error)
             raise UserError(
-                f"{unit.file}: its code needs what robots lack: {what}; export the unit with all that it needs"
+                f"{unit.file}: its code needs what is missing on robots: {what}; export the unit with all that it needs"
             ) from None
         runtime.command(work, system, ["sh", "-c", "nm -D --defined-only /out/unit/unit.so >/out/symbols"], run)
         defined = {line.split()[-1].partition("@")[0] for line in (work / "symbols").read_text().splitlines()}

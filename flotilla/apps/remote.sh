@@ -78,7 +78,7 @@ receive() {
     done
     if [ "$program" ]; then
         ! ldd -r "$part/$program" 2>&1 | grep -e "not found" -e "undefined symbol" >&2 ||
-            refuse "$program needs libraries or functions that the robot lacks; nothing was changed"
+            refuse "$program needs libraries or functions that are missing on the robot; nothing was changed"
     fi
     sync -f "$part"
 

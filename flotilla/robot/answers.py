@@ -1,7 +1,7 @@
-"""What robots answer to provisioning, judged before anything is done with it: a robot may be in other hands.
+"""Validates what robots answer to provisioning before the station uses it: an attacker may control a robot.
 
-Members that decide anything have a type and bounds. All others, such as figures of control tasks, stay as what can be
-shown: text without control characters, numbers that are finite.
+Members on which the station acts have a type and bounds. All others, such as the statistics of control tasks, are kept
+in a form that can be displayed: text without control characters, finite numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _DEPTH = 16
 _TEXT = 1 << 17
 """Characters of a text: what `library/robot_state.py` shows of a file is half of that at most."""
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
-"""Characters that a terminal heeds, and those that turn the direction of writing; not tabulators and ends of lines."""
+"""Characters that control a terminal or change the direction of text; not tabs and line ends."""
 
 Text = Annotated[str, pydantic.StringConstraints(max_length=_TEXT)]
 Word = Annotated[str, pydantic.StringConstraints(pattern=r"^[A-Za-z0-9_.@:/+-]{1,256}$")]

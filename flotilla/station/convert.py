@@ -60,7 +60,7 @@ Read = Callable[[Source], Chunks]
 
 
 def convert(given: Sequence[Path], out: Path, topic: str | None = None) -> list[str]:
-    """Write `out`, whose name tells the form; what came of it, a line each. UserError where that cannot be.
+    """Write `out`, in the format of its suffix, and return a report, a line each. UserError where that is impossible.
 
     `given`: files of recorders, or one MCAP file, of which `topic` is one.
     """

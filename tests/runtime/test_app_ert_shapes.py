@@ -24,10 +24,10 @@ from tests.running import running
 REFUSED = {
     "class": "is C++, and the locked compiler for robots is one for C only; generate C",
     "c++": "is C++, and the locked compiler for robots is one for C only; generate C",
-    "solver": "generated/ lacks rtw_continuous.h: it is a header of MATLAB's own, which the model's options need; let",
-    "cmsis": "generated/ lacks arm_math.h: it is CMSIS, the library of ARM processors, and robots have none; generate",
-    "custom-code": "generated/ lacks pigpio.h: it is neither the coder's nor the C library's, but of code that",
-    "board": "generated/ lacks MW_gpio.h: it is of a hardware support package, and drives a board; generate for no",
+    "solver": "generated/rtw_continuous.h is missing: it is a header of MATLAB's own, which the model's options need;",
+    "cmsis": "generated/arm_math.h is missing: it is CMSIS, the library of ARM processors, and robots have none;",
+    "custom-code": "generated/pigpio.h is missing: it is neither the coder's nor the C library's, but of code that",
+    "board": "generated/MW_gpio.h is missing: it is of a hardware support package, and drives a board; generate for no",
 }
 ACCEPTED = {name: shape for name, shape in SHAPES.items() if name not in REFUSED}
 SILENT = {

@@ -434,13 +434,15 @@ def test_a_binary_that_robots_cannot_load_is_not_built(apps: dict[str, Path]) ->
     place.rename(kept)
     wanting = "double lookup(double); double table(double x) { return lookup(x); }"
     shared(place, wanting, f"-Wl,--no-as-needed,{kept}")
-    with pytest.raises(UserError, match=r"its code needs what robots lack: .*lookup.*; export the unit with all"):
+    with pytest.raises(
+        UserError, match=r"its code needs what is missing on robots: .*lookup.*; export the unit with all"
+    ):
         build(apps["2"])
     shutil.rmtree(apps["2"].parent / "built")
     shared(place.with_name("libtable.so"), "double lookup(double x) { return x; }", "-Wl,-soname,libtable.so")
     shared(place, wanting, f"-L{place.parent}", "-ltable")
     place.with_name("libtable.so").unlink()
-    with pytest.raises(UserError, match=r"needs what robots lack: libtable\.so"):
+    with pytest.raises(UserError, match=r"needs what is missing on robots: libtable\.so"):
         build(apps["2"])
 
 
