@@ -7,6 +7,7 @@ playbook has all of them.
 
 from __future__ import annotations
 
+import base64
 import copy
 import json
 import os
@@ -24,6 +25,8 @@ from flotilla.fleet import inventory
 from lab.containers import scale
 
 SECONDS = 600
+GOOD, RECORDING = "a recording", "heading/log-000001.rec"
+"""What the robot with a good answer has."""
 PROXY = "-o ProxyCommand='touch {planted}'"
 SSH = """#!{python}
 import json, re, sys
@@ -64,6 +67,7 @@ def orders(planted: Path) -> dict[str, Any]:
         "delegation": {"_ansible_delegated_vars": variables, "ansible_delegated_vars": {"robot1": variables}},
         "results": {"results": [{"ansible_facts": variables}, template]},
         "an interpreter": {"ansible_facts": {"discovered_interpreter_python": f"touch {planted};"}},
+        GOOD: {"files": [{"path": f"/var/lib/flotilla/{RECORDING}"}]},
         "a path": {"files": [{"path": "/var/lib/flotilla/../../../outside"}], "stdout": "", "rc": 0},
         "an absolute path": {"files": [{"path": str(planted)}], "stdout": "", "rc": 0},
         "a path with a line": {"files": [{"path": "/var/lib/flotilla/a\n/../../outside"}], "stdout": "", "rc": 0},
@@ -141,8 +145,10 @@ class Played:
     """A playbook that was played on hostile robots."""
 
     said: str
+    own: set[Path]
+    """New files in a robot's own folder."""
     outside: set[Path]
-    """Files that are new, but for those of a robot's own folder."""
+    """All other new files."""
     asked: list[list[str]]
     """What ssh was started with."""
 
@@ -153,7 +159,10 @@ Play = Callable[[str], Played]
 @pytest.fixture(params=["orders", pytest.param("others", marks=pytest.mark.nightly)])
 def answers(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
     """By what is wrong with it. A playbook goes on after orders; after others it ends, as after any fault."""
-    well = {"state": HEALTHY, "stdout": "", "rc": 0, "files": []}  # whatever module is asked
+    well = {
+        "state": HEALTHY, "stdout": "", "rc": 0, "files": [], "stat": {"exists": True, "isdir": False, "checksum": None},
+        "content": base64.b64encode(b"recorded").decode(), "encoding": "base64",
+    }  # fmt: skip  # whatever module is asked
     if request.param == "orders":
         return {name: json.dumps(well | answer) for name, answer in orders(tmp_path / "planted").items()}
     given = failures(tmp_path / "planted") | states()
@@ -189,8 +198,10 @@ def play(tmp_path: Path, answers: dict[str, str]) -> Play:
         own = tuple(str(tmp_path / "build/collected" / robot) + "/" for robot in robots)
         reports = str(tmp_path / "build/reports") + "/"
         new = (files(tmp_path) | files(paths.PROJECT / "ansible")) - before
-        outside = {path for path in new if not str(path).startswith((*own, reports, str(tmp_path / "home") + "/"))}
-        return Played(done.stdout + done.stderr, outside, [json.loads(line) for line in log.read_text().splitlines()])
+        new = {path for path in new if not str(path).startswith((reports, str(tmp_path / "home") + "/"))}
+        inside = {path for path in new if str(path).startswith(own)}
+        asked = [json.loads(line) for line in log.read_text().splitlines()]
+        return Played(done.stdout + done.stderr, inside, new - inside, asked)
 
     return play
 
@@ -201,10 +212,12 @@ def files(directory: Path) -> set[Path]:
 
 @pytest.mark.parametrize("playbook", ["fleet", pytest.param("tasks", marks=pytest.mark.nightly), "collect"])
 def test_nothing_that_a_robot_answers_is_executed_or_written_elsewhere(
-    play: Play, tmp_path: Path, playbook: str
+    play: Play, answers: dict[str, str], tmp_path: Path, playbook: str
 ) -> None:
     """Seen to fail: `keys` of the answer's facts became an option of the next ssh; a recording's path led out."""
     played = play(playbook)
+    if playbook == "collect" and GOOD in answers:
+        assert [path.read_bytes() for path in played.own if path.match(f"*/{RECORDING}")] == [b"recorded"]
     assert len(played.asked) >= len(inventory.load_fleet(tmp_path / "inventory").robots)
     assert not (tmp_path / "planted").exists()
     assert played.outside == set()

@@ -361,7 +361,7 @@ LIMITED = """
 
 
 def test_limits_of_safety_are_set_within_bounds_and_confirmed(flotilla_run: Path, tmp_path: Path) -> None:
-    """Seen to fail: `v_limit.max` took 1e9 in one keystroke, on a robot that drove."""
+    """Before there were bounds, one command set `speed.max` to 1e9."""
     running = Running(flotilla_run, tmp_path, more=LIMITED)
     try:
         listed = running.param().stdout

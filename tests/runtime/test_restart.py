@@ -78,7 +78,7 @@ def waiting(flotilla_run: Path, place: Path) -> list[str]:
 
 def test_an_actuator_waits_until_a_command_was_off(flotilla_run: Path, place: Path) -> None:
     """Held on by somebody over the task's end by SIGKILL. Seen to fail where a start
-    asks nothing of an actuator: it acted in the first step."""
+    requires nothing of an actuator: it acted in the first step."""
     command(place, "1")
     for _ in range(2):
         with started(flotilla_run, place) as task:

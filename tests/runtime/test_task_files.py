@@ -209,7 +209,7 @@ FL_BLOCK(named) = {.abi = FL_ABI, .name = "named", .summary = "", .source = "", 
 
 
 def test_a_plugin_gets_its_own_functions(tasks: Tasks, tmp_path: Path) -> None:
-    """Seen to fail: parameter_size() was the program's of that name, and gave 8."""
+    """Of names that are also those of private functions of the program."""
     (tmp_path / "named.c").write_text(OWN_NAMES)
     own = Tasks(tasks.program, tmp_path, tmp_path)
     compile_shared(tmp_path / "named.c", tmp_path / "named.so", f"-I{HEADERS}")

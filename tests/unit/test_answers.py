@@ -30,7 +30,7 @@ def test_what_a_robot_says_of_a_release_is_taken_with_all_that_it_has() -> None:
     ],
 )
 def test_another_answer_is_refused_by_robot_and_member(change: dict[str, Any], named: str) -> None:
-    """Seen to fail with a traceback, or as a path of the station's."""
+    """Such a base would become part of a path of the station's."""
     with pytest.raises(UserError, match=rf"robot1: its answer is none of a robot's: {named}"):
         answers.judged("robot1", TOLD | change, answers.Told)
 

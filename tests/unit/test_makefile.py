@@ -120,7 +120,7 @@ def test_what_is_given_as_words_is_no_command(tmp_path: Path, target: str) -> No
 
 @pytest.mark.parametrize("target", ["ssh ROBOT=1", "param ROBOT=1 TASK=drive", "scope ROBOT=1 TASK=drive", "provision"])
 def test_the_inventory_reaches_every_program(tmp_path: Path, target: str) -> None:
-    """Seen to fail: these took ansible/inventory, so whoever tuned a simulated robot tuned a real one."""
+    """Whether programs use it: tests/unit/test_param.py."""
     programs = tmp_path / "venv" / "bin"
     programs.mkdir(parents=True)
     (programs / "python").write_text(f'#!/bin/sh\necho "$INVENTORY" >>{tmp_path}/said\n')
