@@ -160,7 +160,7 @@ Play = Callable[[str], Played]
 def answers(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
     """By what is wrong with it. A playbook goes on after orders; after others it ends, as after any fault."""
     well = {
-        "state": HEALTHY, "stdout": "", "rc": 0, "files": [], "stat": {"exists": True, "isdir": False, "checksum": None},
+        "state": HEALTHY, "stdout": "", "rc": 0, "files": [], "stat": {"exists": True, "isdir": False, "checksum": "1"},
         "content": base64.b64encode(b"recorded").decode(), "encoding": "base64",
     }  # fmt: skip  # whatever module is asked
     if request.param == "orders":
