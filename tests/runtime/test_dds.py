@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.running import DDS_ON_LOOPBACK, running
+from tests.running import DDS_ON_LOOPBACK, PATIENCE, Task, running
 
 SENDER = """
 period: 10 ms
@@ -100,5 +102,84 @@ def test_stacks_of_dds_are_small(start: Start) -> None:
         threads = [path.read_text().strip() for path in own.glob("task/*/comm")]
         spans = [line.split()[0].split("-") for line in (own / "maps").read_text().splitlines() if " rw-p " in line]
     stacks = sum(int(end, 16) - int(begin, 16) in (256 << 10, 288 << 10) for begin, end in spans)
-    assert "recvUC" in threads
+    assert "recv" in threads
     assert stacks >= len(threads) - 1, f"{stacks} stacks of that size for {threads}"
+
+
+ADAPTER = "robot0"
+_MAKE = f"ip link add {ADAPTER} type veth peer name other0; ip address add 10.77.0.1/24 dev {ADAPTER}"
+_UP = f"ip link set {ADAPTER} up; ip link set other0 up"
+
+BOTH_WAYS = """
+period: 10 ms
+priority: 0
+blocks:
+  out:
+    type: dds-publish
+    in: {{wrench: [1, 2, 3]}}
+    parameters: {{type: wrench, topic: w, robot: 1, domain: {domain}}}
+  in: {{type: dds-subscribe, parameters: {{type: wrench, topic: w, robot: 1, domain: {domain}}}}}
+"""
+
+
+class Networked:
+    """A task in a network namespace of its own, whose adapter comes and goes."""
+
+    def __init__(self, task: Task, log: Path) -> None:
+        self.task = task
+        self._log = log
+
+    def network(self, commands: str) -> None:
+        """Change its network."""
+        there = ["nsenter", "--target", str(self.task.process.pid), "--user", "--preserve-credentials", "--net"]
+        subprocess.run([*there, "sh", "-e", "-c", commands], check=True)
+
+    def lines(self) -> list[str]:
+        """What it has logged, but for remarks about the computer."""
+        return [line for line in self._log.read_text().splitlines() if "DDS" in line or "ddsi" in line]
+
+
+@pytest.fixture
+def networked(flotilla_run: Path, tmp_path: Path) -> Callable[[str], Any]:
+    """`networked(commands)`: with a network that these make."""
+
+    @contextmanager
+    def start(commands: str) -> Iterator[Networked]:
+        log = tmp_path / "log"
+        # The worst configuration: threads of single sockets.
+        chosen = DDS_ON_LOOPBACK.replace('"lo" multicast="false"', f'"{ADAPTER}"').replace("127.0.0.1", "10.77.0.1")
+        internal = "<Internal><MultipleReceiveThreads>true</MultipleReceiveThreads></Internal>"
+        environment = {"CYCLONEDDS_URI": chosen.replace("</Domain>", f"{internal}</Domain>")}
+        here = ["unshare", "--user", "--map-root-user", "--net"]
+        command: list[str | Path] = [*here, "sh", "-e", "-c", f'{commands}; exec "$@" 2>{log}', "sh", flotilla_run]
+        options: list[str | Path] = ["--blocks", flotilla_run.parent, "--watch", "out.written,in.flag"]
+        text = BOTH_WAYS.format(domain=DOMAIN)
+        with running([*command, *options], tmp_path / "networked.yml", text, environment) as task:
+            yield Networked(task, log)
+
+    return start
+
+
+def test_a_task_ends_after_its_network_adapter_has_gone(networked: Callable[[str], Any]) -> None:
+    """Seen to fail: the task did not end, because Cyclone waited for its thread recvUC, and 100 lines a second were
+    logged, one for each sample."""
+    with networked(f"{_MAKE}; {_UP}") as robot:
+        written = robot.task.until(lambda row: row["out.written"] > 20)["out.written"]
+        robot.network(f"ip link delete {ADAPTER}")
+        robot.task.until(lambda row: row["out.written"] > written + 200)
+        robot.task.signal(signal.SIGTERM)
+        robot.task.process.communicate(timeout=PATIENCE)
+        assert robot.task.process.returncode == 0
+        assert len(robot.lines()) <= 3, robot.lines()  # each says another thing
+
+
+def test_one_line_while_dds_is_not_available(networked: Callable[[str], Any]) -> None:
+    """Seen to fail: two lines a second for each block."""
+    with networked("ip link set lo up") as robot:
+        robot.task.until(lambda row: row["step"] >= 350)  # three attempts at the least
+        (line,) = robot.lines()
+        assert line.endswith(f": DDS domain {DOMAIN}: {ADAPTER}: does not match an available interface; retrying"), line
+        robot.network(f"{_MAKE}; {_UP}")
+        robot.task.until(lambda row: row["in.flag"] == 1)
+        (again,) = robot.lines()[1:]
+        assert again.endswith(f": DDS domain {DOMAIN} is available"), again

@@ -1,8 +1,66 @@
+#define _GNU_SOURCE
 #include "endpoint.h"
 
+#include <dds/ddsrt/log.h>
 #include <math.h>
 #include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
+
+/* --- what Cyclone DDS logs --- */
+
+/* Without a network Cyclone logs each message that it cannot send. A line is written once for each place in its code,
+ * until it has logged nothing for a while. */
+enum { PLACES = 16 };
+#define QUIET_NS (INT64_C(1000000000) * FL_REASONS_STEADY_S)
+
+struct place {
+    const char *file;
+    uint32_t line;
+};
+static struct {
+    pthread_mutex_t lock;
+    struct place written[PLACES];
+    unsigned count;
+    int64_t last_ns;
+} logged = {.lock = PTHREAD_MUTEX_INITIALIZER};
+
+enum { WHY_BYTES = 192 };
+/* Where the first message of the calling thread goes instead; NULL: nowhere else. */
+static _Thread_local char *why;
+
+static bool is_new(struct place place)
+{
+    const int64_t now_ns = fl_now_ns();
+    bool known = false;
+    pthread_mutex_lock(&logged.lock);
+    if (now_ns - logged.last_ns > QUIET_NS)
+        logged.count = 0;
+    logged.last_ns = now_ns;
+    for (unsigned i = 0; i < logged.count; i++)
+        known |= logged.written[i].line == place.line && strcmp(logged.written[i].file, place.file) == 0;
+    known |= logged.count == PLACES;
+    if (!known)
+        logged.written[logged.count++] = place;
+    pthread_mutex_unlock(&logged.lock);
+    return !known;
+}
+
+static void write_log(void *context, const dds_log_data_t *data)
+{
+    (void)context;
+    const char *text = data->message;
+    int length = (int)strlen(text);
+    while (length && strchr(".\n", text[length - 1]))
+        length--;
+    if (why) {
+        if (!*why)
+            snprintf(why, WHY_BYTES, "%.*s", length, text);
+    } else if (is_new((struct place){data->file, data->line})) {
+        fprintf(stderr, "DDS: %.*s\n", length, text);
+    }
+}
 
 /* --- participants --- */
 
@@ -10,37 +68,94 @@
  * many blocks. It belongs to the process as its sockets do, so this is no state of a block. */
 enum { DOMAINS = 8 };
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
-static struct {
-    uint32_t domain;
+static struct domain {
+    bool known;
+    uint32_t number;
     unsigned users;
+    bool missing;       /* why it is not available was logged */
+    dds_entity_t whole; /* what the last user deletes */
     dds_entity_t participant;
-} participants[DOMAINS];
+} domains[DOMAINS];
 
-/* Get the participant, which the first caller creates; negative: a DDS error. Release it after success. */
-static dds_entity_t have_participant(uint32_t domain)
+/* $CYCLONEDDS_URI, and what the end of a task depends on: Cyclone wakes a thread that receives for one socket alone by
+ * a datagram over the network, and waits for that thread. Without the network it waits for ever. */
+static char *configuration(void)
 {
-    dds_entity_t result = DDS_RETCODE_OUT_OF_RESOURCES;
-    int slot = -1;
-    pthread_mutex_lock(&lock);
-    for (int i = 0; i < DOMAINS; i++)
-        if (participants[i].users ? participants[i].domain == domain : slot < 0)
-            slot = i;
-    if (slot >= 0 && !participants[slot].users)
-        participants[slot].participant = dds_create_participant(domain, NULL, NULL);
-    if (slot >= 0 && (result = participants[slot].participant) >= 0) {
-        participants[slot].domain = domain;
-        participants[slot].users++;
-    }
-    pthread_mutex_unlock(&lock);
-    return result;
+    static const char one_thread[] = "<CycloneDDS><Domain Id=\"any\"><Internal>"
+                                     "<MultipleReceiveThreads>false</MultipleReceiveThreads>"
+                                     "</Internal></Domain></CycloneDDS>";
+    const char *uri = getenv("CYCLONEDDS_URI");
+    char *both = NULL;
+    return asprintf(&both, "%s%s%s", uri ? uri : "", uri && *uri ? "," : "", one_thread) < 0 ? NULL : both;
 }
 
-static void release_participant(uint32_t domain)
+static dds_entity_t create(struct domain *domain)
+{
+    char *both = configuration();
+    domain->whole = both ? dds_create_domain(domain->number, both) : DDS_RETCODE_OUT_OF_RESOURCES;
+    free(both);
+    if (domain->whole < 0 && domain->whole != DDS_RETCODE_PRECONDITION_NOT_MET)
+        return domain->whole;
+    dds_entity_t participant = dds_create_participant(domain->number, NULL, NULL);
+    if (domain->whole < 0) /* somebody else in this process has created the domain */
+        domain->whole = participant;
+    else if (participant < 0)
+        dds_delete(domain->whole);
+    return participant;
+}
+
+/* Log once why the domain is not available, or that it is again. */
+static void log_domain(struct fl_block *block, struct domain *domain, const char *reason)
+{
+    bool missing = domain->participant < 0;
+    if (missing == domain->missing)
+        return;
+    domain->missing = missing;
+    if (missing)
+        fl_log(block, "DDS domain %u: %s; retrying", (unsigned)domain->number,
+               *reason ? reason : dds_strretcode(domain->participant));
+    else
+        fl_log(block, "DDS domain %u is available", (unsigned)domain->number);
+}
+
+static struct domain *domain_numbered(uint32_t number)
+{
+    for (int i = 0; i < DOMAINS; i++) {
+        if (!domains[i].known)
+            domains[i] = (struct domain){.known = true, .number = number};
+        if (domains[i].number == number)
+            return &domains[i];
+    }
+    return NULL;
+}
+
+/* Get the participant, which the first caller creates; negative: a DDS error, which is logged. Release it after
+ * success. */
+static dds_entity_t have_participant(struct fl_block *block, uint32_t number)
+{
+    dds_entity_t participant = DDS_RETCODE_OUT_OF_RESOURCES;
+    pthread_mutex_lock(&lock);
+    struct domain *domain = domain_numbered(number);
+    if (domain && !domain->users) {
+        char reason[WHY_BYTES] = "";
+        dds_set_log_sink(write_log, NULL);
+        why = reason;
+        domain->participant = create(domain);
+        why = NULL;
+        log_domain(block, domain, reason);
+    }
+    if (domain && (participant = domain->participant) >= 0)
+        domain->users++;
+    pthread_mutex_unlock(&lock);
+    return participant;
+}
+
+static void release_participant(uint32_t number)
 {
     pthread_mutex_lock(&lock);
-    for (int i = 0; i < DOMAINS; i++)
-        if (participants[i].users && participants[i].domain == domain && --participants[i].users == 0)
-            dds_delete(participants[i].participant);
+    struct domain *domain = domain_numbered(number);
+    if (--domain->users == 0)
+        dds_delete(domain->whole);
     pthread_mutex_unlock(&lock);
 }
 
@@ -71,7 +186,7 @@ static dds_qos_t *qualities_of(const struct dds_topic *topic)
 
 /* Serve until the thread has to return: true; false when DDS is not available now. */
 static bool serve(const struct dds_endpoint *endpoint, const struct dds_topic *topic, struct fl_block *block,
-                  struct fl_driver *driver, void *context, dds_entity_t participant)
+                  struct fl_driver *driver, void *context, dds_entity_t participant, struct fl_reasons *reasons)
 {
     dds_listener_t *listener = dds_create_listener(context);
     dds_qos_t *qualities = qualities_of(topic);
@@ -81,7 +196,7 @@ static bool serve(const struct dds_endpoint *endpoint, const struct dds_topic *t
     dds_delete_qos(qualities);
     dds_delete_listener(listener);
     if (entity < 0) {
-        fl_log(block, "topic %s: %s", topic->name, dds_strretcode(entity));
+        fl_reasons_log(reasons, block, fl_now_ns(), "topic %s: %s; retrying", topic->name, dds_strretcode(entity));
     } else {
         endpoint->serve(context, driver, entity);
         dds_delete(entity); /* waits for a listener that is being called */
@@ -94,13 +209,12 @@ static bool serve(const struct dds_endpoint *endpoint, const struct dds_topic *t
 void dds_run(const struct dds_endpoint *endpoint, const struct dds_topic *topic, struct fl_block *block,
              struct fl_driver *driver, void *context)
 {
+    struct fl_reasons reasons = {0};
     do {
-        dds_entity_t participant = have_participant(topic->domain);
-        if (participant < 0) {
-            fl_log(block, "DDS domain %u: %s", (unsigned)topic->domain, dds_strretcode(participant));
+        dds_entity_t participant = have_participant(block, topic->domain);
+        if (participant < 0)
             continue;
-        }
-        bool done = serve(endpoint, topic, block, driver, context, participant);
+        bool done = serve(endpoint, topic, block, driver, context, participant, &reasons);
         release_participant(topic->domain);
         if (done)
             return;

@@ -37,7 +37,7 @@ def dds(pentium: RobotGuest, fleet: Fleet) -> dict[str, Any]:
         (r"<FragmentSize>.*?<", "<FragmentSize>500B<"),
         (r"<MaxAutoParticipantIndex>.*?<", "<MaxAutoParticipantIndex>3<"),
         (r"(?s)<Peers>.*?</Peers>", f'<Peers><Peer Address="{pentium.robot.address}"/></Peers>'),
-        (r"<MultipleReceiveThreads>.*?<", "<MultipleReceiveThreads>false<"),
+        (r"<MultipleReceiveThreads>.*?<", "<MultipleReceiveThreads>true<"),
         (r"(?s)<Threads>.*?</Threads>", ""),
     )
     alone = _edited(
@@ -61,7 +61,7 @@ def _edited(text: str, *changes: tuple[str, str]) -> str:
     return text
 
 
-_DDS_HOUSEKEEPING = ("recv", "tev", "gc", "dq.builtins")
+_DDS_HOUSEKEEPING = ("tev", "gc", "dq.builtins")
 """Cyclone's threads that need not be in time."""
 
 
@@ -86,7 +86,7 @@ def _asked(run: dict[str, Any], *, own: bool) -> list[tuple[str, int]]:
         _dds_case("ParticipantIndex", lambda run: {0, 1, 2, 3} <= set(run["bound"]), True, "alone"),
         _dds_case("MaxAutoParticipantIndex", lambda run: len(_asked(run, own=True)), 6),
         _dds_case("Peers", lambda run: _asked(run, own=False), "everyone"),
-        _dds_case("MultipleReceiveThreads", lambda run: sorted(set(run["threads"]) & {"recvMC", "recvUC"}), ["recvUC"]),
+        _dds_case("MultipleReceiveThreads", lambda run: sorted(set(run["threads"]) & {"recvMC", "recvUC"}), []),
         _dds_case("Scheduling", lambda run: run["real_time"], dict.fromkeys(_DDS_HOUSEKEEPING, 40)),
         _dds_case("StackSize", lambda run: run["stacks"] >= 5, True),
         _dds_case("SocketReceiveBufferSize", lambda run: run["ended"], [None, None], "greedy"),
