@@ -105,7 +105,8 @@ def _make(subject: app.App, description: app.Make, system: System, out: Path, ru
         made = source / description.program
         made.unlink(missing_ok=True)
         # From the environment, because a Makefile may add to these; it cannot to what stands on make's command line.
-        variables = ["CC=gcc", "AR=ar", "PKG_CONFIG=pkg-config", "CFLAGS=-O2 -I/out/include"]
+        flags = " ".join(["-O2", *toolchain.LONG_TIMES, "-I/out/include"])
+        variables = ["CC=gcc", "AR=ar", "PKG_CONFIG=pkg-config", f"CFLAGS={flags}"]
         variables += ["LDFLAGS=-Wl,--build-id=none"]
         runtime.command(Path(directory), system, ["env", "-C", "/out/source", *variables, "make"], run)
         if not made.is_file():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 _ROOT_MODULES = ["squashfs", "ext4", "overlay"]
 """What the root and the layers above it need; loading it later, by name, would cost the boot a second."""
-_APPLETS = "sh mount insmod cat hexdump usleep seq switch_root"
+_APPLETS = "sh mount insmod cat date hexdump usleep seq switch_root touch umount uname"
 
 
 def build(tools: Path, target: Path, version: str, modules: list[str]) -> bytes:

@@ -112,7 +112,7 @@ def compile_shared(
         else:
             (work / "source").mkdir()
             shutil.copy(source, work / "source")
-        gcc, objects = ["env", "-C", "/out/source", "gcc", "-O2", "-fPIC"], []
+        gcc, objects = ["env", "-C", "/out/source", "gcc", "-O2", "-fPIC", *toolchain.LONG_TIMES], []
         if others:
             command(work, system, [*gcc, "-c", *their_options, *others], run)
             objects = [f"{Path(name).stem}.o" for name in others]

@@ -23,7 +23,10 @@ _ARCHITECTURES = {
 """Options by Debian's name of the architecture, for the oldest processor that its packages run on."""
 Run = Callable[[str, Path, Sequence[str], Path], None]
 """Runs a command among the packages of a lock: `run`, or the same elsewhere."""
-_OPTIONS = ["-O2", "-Wl,--build-id=none", "-s"]
+LONG_TIMES = ("-D_FILE_OFFSET_BITS=64", "-D_TIME_BITS=64")
+"""Options for times beyond 2038, of files and clocks, also where a long has 32 bits. Nothing of the interface of blocks
+depends on them."""
+_OPTIONS = ["-O2", *LONG_TIMES, "-Wl,--build-id=none", "-s"]
 
 
 def compile_static(source: Path, board: Board, options: Sequence[str] = ()) -> bytes:

@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "authentication.h"
 
+#include "wall_clock.h"
+
 #include <arpa/inet.h>
 #include <endian.h>
 #include <errno.h>
@@ -10,7 +12,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/random.h>
-#include <time.h>
 
 enum { NUMBER = 8, TAG = 16 };
 /* Where the numbers of a trailer and of a challenge lie, and what follows them. */
@@ -123,14 +124,14 @@ static void draw(const uint8_t key[AUTHENTICATION_KEY], uint8_t drawn[AUTHENTICA
 {
     struct {
         uint8_t chance[AUTHENTICATION_KEY];
-        struct timespec clocks[2];
+        int64_t clocks_ns[2];
     } seed;
     struct hmac_sha256_ctx hash;
     memset(&seed, 0, sizeof seed);                                     /* its gaps, too */
     if (getrandom(seed.chance, sizeof seed.chance, GRND_NONBLOCK) < 0) /* waiting would hold up the task */
         getrandom(seed.chance, sizeof seed.chance, GRND_INSECURE);
-    clock_gettime(CLOCK_REALTIME, &seed.clocks[0]);
-    clock_gettime(CLOCK_MONOTONIC, &seed.clocks[1]);
+    seed.clocks_ns[0] = fl_clock_ns(CLOCK_REALTIME);
+    seed.clocks_ns[1] = fl_clock_ns(CLOCK_MONOTONIC);
     hmac_sha256_set_key(&hash, AUTHENTICATION_KEY, key);
     hmac_sha256_update(&hash, sizeof seed, (const uint8_t *)&seed);
     hmac_sha256_digest(&hash, AUTHENTICATION_KEY, drawn);

@@ -9,7 +9,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
 
 static const struct {
     const char *name;
@@ -36,13 +35,6 @@ int fl_type_named(const char *name)
         if (strcmp(types[type].name, name) == 0)
             return type;
     return -1;
-}
-
-int64_t fl_now_ns(void)
-{
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
 }
 
 void *fl_allocate(struct fl_block *block, size_t bytes)

@@ -183,9 +183,8 @@ void fl_rates_release(struct fl_block *block)
 void fl_rates_stop(struct fl_block *block)
 {
     struct fl_rates *rates = block->service->rates;
-    struct timespec until;
-    clock_gettime(CLOCK_MONOTONIC, &until);
-    until.tv_sec += JOIN_S;
+    const int64_t until_ns = fl_now_ns() + JOIN_S * SECOND_NS;
+    const struct timespec until = {(time_t)(until_ns / SECOND_NS), (long)(until_ns % SECOND_NS)};
     for (uint32_t i = 0; rates && i < rates->count; i++) {
         atomic_store_explicit(&rates->each[i].stop, true, memory_order_release);
         if (rates->each[i].started)

@@ -392,7 +392,10 @@ static size_t write_answer(const struct transfer *transfer, unsigned question, u
 static int64_t now_ms(void)
 {
     struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
+    if (clock_gettime(CLOCK_MONOTONIC, &now) < 0) {
+        perror("flotilla-receive: the monotonic clock");
+        exit(1);
+    }
     return (int64_t)now.tv_sec * 1000 + now.tv_nsec / 1000000;
 }
 

@@ -247,10 +247,8 @@ static bool find_disk(char *path, size_t size)
 static void wait_for_a_trial(void)
 {
     const char *seconds = argument_of_kernel("flotilla.trial_s=");
-    struct timespec until;
-    clock_gettime(CLOCK_BOOTTIME, &until);
-    until.tv_sec += seconds ? strtol(seconds, NULL, 10) : TRIAL_S;
-    while (clock_nanosleep(CLOCK_BOOTTIME, TIMER_ABSTIME, &until, NULL) == EINTR)
+    struct timespec left = {.tv_sec = seconds ? strtol(seconds, NULL, 10) : TRIAL_S};
+    while (clock_nanosleep(CLOCK_BOOTTIME, 0, &left, &left) == EINTR)
         ;
 }
 

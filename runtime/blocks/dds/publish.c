@@ -7,6 +7,7 @@
  * the newest of those that wait. `written` counts what DDS took. While DDS cannot be had the thread tries again every
  * second, and writes to the journal. While `withhold` is 1 the block is silent, so that subscribers fail over.
  */
+#include "core/wall_clock.h"
 #include "sender.h"
 #include "topic.h"
 
@@ -61,7 +62,7 @@ static int step(struct fl_block *block)
     if (sample) {
         sample->robot = (uint16_t)set->robot;
         sample->number = state->number++;
-        sample->stamp_ns = dds_wall_ns();
+        sample->stamp_ns = fl_clock_ns(CLOCK_REALTIME);
         memcpy(sample->values, block->in[DDS_DATA], dds_value_bytes(&set->common));
     }
     dds_sender_end(&state->sender, sample);

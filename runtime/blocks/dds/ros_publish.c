@@ -11,6 +11,7 @@
  * dropped, as is all but the newest of those that wait. `written` counts what DDS took. While DDS cannot be had the
  * thread tries again every second, and writes to the journal. While `withhold` is 1 the block is silent.
  */
+#include "core/wall_clock.h"
 #include "message.h"
 #include "sender.h"
 
@@ -113,7 +114,7 @@ static int64_t stamp_of(const struct fl_block *block)
 {
     const double longest_s = 1e6;
     double age_s = fmin(fmax(0, FL_IN(block, DDS_DATA, double)), longest_s); /* 0 for NaN */
-    int64_t stamp_ns = dds_wall_ns() - llround(age_s * 1e9);
+    int64_t stamp_ns = fl_clock_ns(CLOCK_REALTIME) - llround(age_s * 1e9);
     return stamp_ns > 0 ? stamp_ns : 0;
 }
 

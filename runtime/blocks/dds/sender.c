@@ -5,7 +5,6 @@
 #include <math.h>
 #include <string.h>
 #include <sys/socket.h>
-#include <time.h>
 #include <unistd.h>
 
 enum { WAITING = 4 };
@@ -23,13 +22,6 @@ const struct fl_port dds_sender_outputs[] = {
     {.name = "peers", .type = FL_UINT32, .width = 1, .summary = "subscribers that are known now"},
     {.name = "written", .type = FL_UINT32, .width = 1, .summary = "samples that DDS took"},
 };
-
-int64_t dds_wall_ns(void)
-{
-    struct timespec real;
-    clock_gettime(CLOCK_REALTIME, &real);
-    return real.tv_sec * INT64_C(1000000000) + real.tv_nsec;
-}
 
 static void matched(dds_entity_t writer, const dds_publication_matched_status_t status, void *context)
 {

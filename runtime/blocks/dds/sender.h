@@ -41,7 +41,4 @@ void dds_sender_end(struct dds_sender *sender, const void *made);
 
 void dds_sender_stop(struct dds_sender *sender);
 
-/* Nanoseconds since 1970-01-01 UTC, by CLOCK_REALTIME. */
-int64_t dds_wall_ns(void);
-
 #endif
