@@ -1,12 +1,17 @@
 """What the service of a control task or an app may do beyond files: its user, and privileges for the devices that its
 blocks drive.
 
-Services have none (runtime/systemd/), because who drives I/O ports can do whatever the computer can.
+Services have none (runtime/systemd/), because who drives I/O ports can do whatever the computer can. What blocks need,
+their types say (FL_CAN_INTERFACE and the like in flotilla/block.h).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import functools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 SHARED_USER = "control"
 """Of tasks that somebody brings to a robot by hand. Its group is that of message queues between tasks."""
@@ -16,11 +21,8 @@ USERS = {SHARED_USER: 901, "app": 902} | {f"{SHARED_USER}{number}": 910 + number
 """Numbers by name, which are fixed, because the data partition outlives releases."""
 DEVICES = "/dev/robot/"
 """Where a robot's devices are, by their names in the inventory."""
-_PORT_BLOCKS = ("ir104-pbf",)
-"""Blocks that drive I/O ports (ioperm(2))."""
-_CAMERA_BLOCKS = ("frame-grabber-iidc", "frame-grabber-v4l2")
-CAN_BLOCKS = ("can-receive", "can-send", "epos2")
-"""Blocks on a CAN interface, `can0` unless they say another."""
+RUNTIME_NEEDS = Path(__file__).with_name("block_needs.json")
+"""What blocks of the runtime need, as `flotilla-blocks --json` lists it: `make reference` writes it."""
 DROP_IN = "io-ports.conf"
 """Name of the file that has `IO_PORTS`, in the folder of a service's drop-ins."""
 IO_PORTS = """\
@@ -34,17 +36,64 @@ USER_DROP_IN = "user.conf"
 """Name of the file that has what `user` says."""
 
 
-def user(number: int, description: object) -> str:
+class Need(NamedTuple):
+    """A parameter of a block that names what the block needs a permission for."""
+
+    parameter: str
+    what: Literal["can", "io-ports", "camera"]
+    default: str = ""
+
+
+Needs = Mapping[str, Sequence[Need]]
+"""By type of block; blocks without any may be left out."""
+
+
+def needs_of(listing: Sequence[Mapping[str, Any]]) -> dict[str, list[Need]]:
+    """What blocks need that `flotilla-blocks --json` lists."""
+    found = {
+        block["name"]: [
+            Need(parameter["name"], parameter["needs"], parameter.get("default", ""))
+            for parameter in block["parameters"]
+            if "needs" in parameter
+        ]
+        for block in listing
+    }
+    return {name: needs for name, needs in found.items() if needs}
+
+
+@functools.cache
+def runtime_needs() -> Needs:
+    """What blocks of the runtime need, which control tasks consist of."""
+    listed: dict[str, list[list[str]]] = json.loads(RUNTIME_NEEDS.read_text(encoding="utf-8"))
+    return {name: [Need(*need) for need in needs] for name, needs in listed.items()}  # type: ignore[arg-type]
+
+
+def needs_page(listing: Sequence[Mapping[str, Any]]) -> str:
+    """The content of `RUNTIME_NEEDS`."""
+    lines = (f"  {json.dumps(name)}: {json.dumps(needs)}" for name, needs in needs_of(listing).items())
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def can_interfaces(description: object) -> Iterator[tuple[str, str, str]]:
+    """Which CAN interfaces a control task uses, rendered and parsed: block, parameter, interface."""
+    for name, block, need in _needed(description, runtime_needs()):
+        if need.what == "can":
+            parameters = block.get("parameters")
+            given = parameters.get(need.parameter) if isinstance(parameters, dict) else None
+            yield name, need.parameter, str(given or need.default)
+
+
+def user(number: int, description: object, needs: Needs | None = None) -> str:
     """The user of a robot's control task and the groups of its devices, as a drop-in of its service.
 
     `number`: which of the robot's tasks it is, from 0. `description`: the task, rendered and parsed. Its own ports are
-    given to it by udev.
+    given to it by udev. `needs`: of its blocks, where they are not the runtime's.
     """
-    kinds = {block.get("type") for block in _blocks(description)}
+    needed = {need.what for _, _, need in _needed(description, runtime_needs() if needs is None else needs)}
     groups = ["realtime", SHARED_USER]
     if any(path.startswith("/dev/tty") for path in _device_paths(description)):
         groups.append("dialout")
-    if not kinds.isdisjoint(_CAMERA_BLOCKS):
+    if "camera" in needed:
         groups.append("video")
     lines = [
         "# A user of its own, and no devices but its own.",
@@ -56,7 +105,7 @@ def user(number: int, description: object) -> str:
         f"Environment=FLOTILLA_QUEUE_GROUP={SHARED_USER}",
         "SystemCallFilter=fchown fchown32",
     ]
-    if kinds.isdisjoint(CAN_BLOCKS):
+    if "can" not in needed:
         lines.append("RestrictAddressFamilies=~AF_CAN")
     return "".join(f"{line}\n" for line in lines)
 
@@ -92,22 +141,32 @@ def shared_devices(descriptions: Mapping[str, object]) -> Iterator[tuple[str, st
                 yield name, f"{DEVICES}{device} is open in {other} too: read it in one task, and send what it says"
 
 
-def drives_io_ports(description: object) -> bool:
-    """Whether a task, as parsed, has a block that does. What is no task in other ways is the runtime's to say."""
-    return any(block.get("type") in _PORT_BLOCKS for block in _blocks(description))
+def drives_io_ports(description: object, needs: Needs | None = None) -> bool:
+    """Whether a task, as parsed, has a block that does. What is no task in other ways is the runtime's to say.
+
+    `needs`: of blocks that the runtime does not have.
+    """
+    return any(need.what == "io-ports" for _, _, need in _needed(description, {**runtime_needs(), **(needs or {})}))
 
 
 def _name(number: int) -> str:
     return f"{SHARED_USER}{number + 1}"
 
 
-def _blocks(description: object) -> list[dict[str, object]]:
+def _blocks(description: object) -> dict[str, dict[str, object]]:
     found = description.get("blocks") if isinstance(description, dict) else None
-    return [block for block in found.values() if isinstance(block, dict)] if isinstance(found, dict) else []
+    return {name: block for name, block in found.items() if isinstance(block, dict)} if isinstance(found, dict) else {}
+
+
+def _needed(description: object, needs: Needs) -> Iterator[tuple[str, dict[str, object], Need]]:
+    """Each block's name and content, with each thing that it needs."""
+    for name, block in _blocks(description).items():
+        for need in needs.get(str(block.get("type")), ()):
+            yield name, block, need
 
 
 def _device_paths(description: object) -> Iterator[str]:
-    for block in _blocks(description):
+    for block in _blocks(description).values():
         parameters = block.get("parameters")
         for value in parameters.values() if isinstance(parameters, dict) else ():
             if isinstance(value, str) and value.startswith("/dev/"):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from flotilla.common import paths
+from flotilla.fleet import privileges
 from flotilla.reference.markdown import MADE, code, literal, table
 from flotilla.reference.programs import listing
 
@@ -58,6 +59,7 @@ What a task can be made of. [Task file](task-file.md) says how a task names them
   `make top ASK=1` name it if it is not 0.
 - A tunable parameter may change while the task runs (`make param`). An exclusive one names a device, alone or with the
   others that are exclusive: one block may have it.
+- A task gets the permissions that its blocks need: `can`, `io-ports`, `camera`.
 - `doubles` and `strings` are lists, or one value. A `device` is a path that begins with a slash.
 """
 
@@ -71,6 +73,11 @@ def headers(text: str) -> dict[str, dict[str, str]]:
         found[name] = {"Description": parts[0].strip()}
         found[name] |= {title: part.strip("\n") for title, part in zip(parts[1::2], parts[2::2], strict=True)}
     return found
+
+
+def needs(programs: Path) -> str:
+    """What blocks need permissions for, for `privileges.RUNTIME_NEEDS`."""
+    return privileges.needs_page(listing(programs, "flotilla-blocks", "--blocks", str(programs), "--json"))
 
 
 def page(programs: Path) -> str:
@@ -147,6 +154,8 @@ def _port(port: dict[str, Any]) -> tuple[str, str, str, str]:
 
 def _parameter(parameter: dict[str, Any]) -> tuple[str, str, str, str, str]:
     marks = [mark for mark in ("tunable", "exclusive") if parameter.get(mark)]
+    if "needs" in parameter:
+        marks.append(f"needs permission: {parameter['needs']}")
     if parameter.get("timeout"):
         marks.append("ends the task if no step ends for this long")
     return (

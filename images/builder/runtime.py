@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flotilla.common import cache, namespace, paths, progress, sources, together
 from flotilla.common.errors import UserError
@@ -121,14 +122,16 @@ def compile_shared(
         return (work / "plugin.so").read_bytes()
 
 
-def check_plugins(directory: Path, system: System) -> None:
-    """Let the runtime judge plug-ins: the interface that they were made for, names that are taken.
+def check_plugins(directory: Path, system: System) -> list[dict[str, Any]]:
+    """Let the runtime judge plug-ins: the interface that they were made for, names that are taken. Returns all blocks.
 
     It runs on this computer as a robot of the plug-ins' `system` has it; so does it below.
     """
-    done = _run(system, "flotilla-blocks", "--blocks", str(directory))
+    done = _run(system, "flotilla-blocks", "--blocks", str(directory), "--json")
     if done.returncode:
         raise UserError(_said(done).replace(f"{directory}/", ""))
+    listing: list[dict[str, Any]] = json.loads(done.stdout)
+    return listing
 
 
 def check_task(path: Path, content: bytes, plugins: Path | None = None, system: System = HOST) -> None:

@@ -39,6 +39,8 @@ static const char *fault(const struct registry *registry, const struct fl_block_
             return "a parameter of type int has no choices, or another has some";
         if (parameter->flags & FL_ACTUATOR_TIMEOUT && parameter->kind != FL_KIND_DOUBLE)
             return "an actuator's time-out is not a double";
+        if (parameter->flags & FL_CAN_INTERFACE && parameter->kind != FL_KIND_STRING)
+            return "the name of a CAN interface is not a string";
         if (parameter->offset >= type->parameters_size)
             return "a parameter lies outside its structure";
     }

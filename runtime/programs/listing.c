@@ -16,6 +16,20 @@ static const char *const kinds[] = {
     [FL_KIND_STRINGS] = "strings", [FL_KIND_CHOICE] = "choice",   [FL_KIND_DEVICE] = "device",
 };
 
+static const struct {
+    unsigned flag;
+    const char *name;
+} needs[] = {{FL_CAN_INTERFACE, "can"}, {FL_IO_PORTS, "io-ports"}, {FL_CAMERA, "camera"}};
+
+/* What a task with the parameter's block needs a permission for; NULL: nothing. */
+static const char *need_of(const struct fl_parameter *parameter)
+{
+    for (size_t i = 0; i < sizeof needs / sizeof needs[0]; i++)
+        if (parameter->flags & needs[i].flag)
+            return needs[i].name;
+    return NULL;
+}
+
 /* A block to list: its type, and its ports if parameters were given. */
 struct listed {
     const struct fl_block_type *type;
@@ -53,6 +67,8 @@ static void print_parameters(const struct fl_block_type *type, FILE *out)
         if (parameter->min < parameter->max)
             fprintf(out, "; %g to %g", parameter->min, parameter->max);
         fprintf(out, parameter->default_value ? "; default %s" : "; required", given(parameter->default_value));
+        if (need_of(parameter))
+            fprintf(out, "; needs permission: %s", need_of(parameter));
         fputs(parameter->flags & FL_TUNABLE ? "; tunable\n" : "\n", out);
     }
 }
@@ -121,6 +137,7 @@ static void write_parameters(const struct fl_block_type *type, FILE *out)
         write_flag("tunable", parameter->flags & FL_TUNABLE, out);
         write_flag("exclusive", parameter->flags & FL_EXCLUSIVE || parameter->kind == FL_KIND_DEVICE, out);
         write_flag("timeout", parameter->flags & FL_ACTUATOR_TIMEOUT, out);
+        json_member("needs", need_of(parameter), out);
         fputc('}', out);
     }
     fputs("]}", out);

@@ -81,3 +81,16 @@ def test_apps_have_the_same_bytes_wherever_built_and_lie_on_the_card(tmp_path: P
         linked = re.search(r'Fast link dest: "(.*)"', shown)
         found = linked[1] if linked else data.read(str(inside))
         assert found == target
+
+
+def test_an_app_may_do_what_its_own_block_declares(tmp_path: Path) -> None:
+    """Seen to fail: only tasks with the runtime's own block of relays got the privilege for I/O ports."""
+    board = inventory.load_fleet().boards["smartcoret3"]
+    scaffold.create("block", "ports", tmp_path)
+    source = tmp_path / "ports/ports.c"
+    text = source.read_text()
+    for more in ("", " | FL_IO_PORTS"):
+        source.write_text(text.replace("FL_TUNABLE", f"FL_TUNABLE{more}"))
+        out = tmp_path / f"out{len(more)}"
+        builder.build(app.load(tmp_path / "ports"), board, out)
+        assert (out / "unit.d/io-ports.conf").exists() is bool(more)

@@ -31,7 +31,7 @@ struct iidc {
 #define RATES "1.875|3.75|7.5|15|30|60"
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct iidc, guid, .default_value = "",
+    FL_PARAMETER(struct iidc, guid, .flags = FL_CAMERA, .default_value = "",
                  .summary =
                      "the camera's number, 16 hexadecimal digits as on its label; empty: the first that is found"),
     GRABBER_PARAMETERS(struct iidc),

@@ -30,7 +30,7 @@ struct v4l2 {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct v4l2, device, .default_value = "/dev/video0", .summary = "the camera"),
+    FL_PARAMETER(struct v4l2, device, .flags = FL_CAMERA, .default_value = "/dev/video0", .summary = "the camera"),
     GRABBER_PARAMETERS(struct v4l2),
     FL_PARAMETER(struct v4l2, rate, .default_value = "0", .min = 0, .max = 1000, .unit = "1/s",
                  .summary = "images to take; 0 leaves it to the camera"),

@@ -25,7 +25,8 @@ struct received {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct can_receive, interface, .default_value = "can0", .summary = "network interface of the bus"),
+    FL_PARAMETER(struct can_receive, interface, .flags = FL_CAN_INTERFACE, .default_value = "can0",
+                 .summary = "network interface of the bus"),
     FL_PARAMETER(struct can_receive, id, .min = 0, .max = CAN_EFF_MASK, .summary = "identifier to receive"),
     FL_PARAMETER(struct can_receive, mask, .default_value = "0x1FFFFFFF", .min = 0, .max = CAN_EFF_MASK,
                  .summary = "bits of the identifier that must be as in `id`"),

@@ -28,7 +28,7 @@ struct sent {
 };
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct can_send, interface, .flags = FL_EXCLUSIVE, .default_value = "can0",
+    FL_PARAMETER(struct can_send, interface, .flags = FL_EXCLUSIVE | FL_CAN_INTERFACE, .default_value = "can0",
                  .summary = "network interface of the bus"),
     FL_PARAMETER(struct can_send, id, .flags = FL_EXCLUSIVE, .min = 0, .max = CAN_EFF_MASK,
                  .summary = "identifier of the frames"),

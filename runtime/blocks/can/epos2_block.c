@@ -51,7 +51,7 @@ struct state {
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct epos2_block, interface, .flags = FL_EXCLUSIVE, .default_value = "can0",
+    FL_PARAMETER(struct epos2_block, interface, .flags = FL_EXCLUSIVE | FL_CAN_INTERFACE, .default_value = "can0",
                  .summary = "network interface of the bus"),
     FL_PARAMETER(struct epos2_block, node, .flags = FL_EXCLUSIVE, .min = 1, .max = 127,
                  .summary = "the drive's node address"),

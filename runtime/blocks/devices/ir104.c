@@ -45,7 +45,7 @@ enum fresh { BY_FLAG, BY_SEQUENCE };
 static const uint16_t bases[] = {0x240, 0x260, 0x280, 0x300};
 
 static const struct fl_parameter parameters[] = {
-    FL_PARAMETER(struct ir104, base, .flags = FL_EXCLUSIVE, .default_value = "0x300",
+    FL_PARAMETER(struct ir104, base, .flags = FL_EXCLUSIVE | FL_IO_PORTS, .default_value = "0x300",
                  .choices = "0x240|0x260|0x280|0x300", .summary = "address of the board, as its jumpers say"),
     FL_PARAMETER(struct ir104, channels, .default_value = "", .min = 1, .max = RELAYS,
                  .summary = "relays to drive, in the order of `command`; the others stay off; none: read inputs only"),

@@ -113,6 +113,11 @@ enum {
        while the task runs only within the bounds that the task file gives it, and only by who confirms the old and the
        new value */
     FL_SAFETY = 1u << 3,
+    /* names what the task needs a permission for, whatever its value: a CAN interface (a string), I/O ports that are
+       driven after ioperm(2), or a camera. The service of the task gets the permission because of this flag. */
+    FL_CAN_INTERFACE = 1u << 4,
+    FL_IO_PORTS = 1u << 5,
+    FL_CAMERA = 1u << 6,
 };
 
 struct fl_parameter {
