@@ -9,7 +9,7 @@
 #include <sys/mman.h>
 #include <time.h>
 
-enum { PERIOD_NS = 10000000, PRIORITY = 70, SECOND_NS = 1000000000, BINS = 10000 };
+enum { PERIOD_NS = 10000000, PRIORITY = 64, SECOND_NS = 1000000000, BINS = 10000 };
 
 /* Times, counted in bins of 1 µs; the last one holds all that are longer. */
 struct times {

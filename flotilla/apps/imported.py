@@ -177,7 +177,7 @@ def _task(work: Path, name: str, model: str, sample_times_s: Sequence[float], sy
         wired = f", in: {json.dumps(zeros)}" if zeros else ""
         return (
             f"# The model alone. `{name}.PORT` reads an output; docs/how-to/control-tasks.md says what else there is.\n"
-            f"period: {found.period_s * 1000:g} ms\npriority: 70\nblocks:\n  {name}: {{type: {name}{wired}}}\n"
+            f"period: {found.period_s * 1000:g} ms\npriority: 64\nblocks:\n  {name}: {{type: {name}{wired}}}\n"
         )
     raise errors[0]
 

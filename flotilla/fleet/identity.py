@@ -152,6 +152,7 @@ def _control_tasks(fleet: Fleet, robot: Robot) -> dict[str, tuple[bytes, object]
         found = [
             *(problem for task, problem in shared_devices if task == name),
             *_problems_of_processor(description, fleet.boards[robot.board]),
+            *_problems_of_priority(description),
             *interfaces.problems(description, fleet, robot),
             *transport.problems(fleet, name, description),
         ]
@@ -168,6 +169,25 @@ def _problems_of_processor(task: object, board: Board) -> list[str]:
     return [
         f"cpu: {cpu}: board {board.name} has processors 0 to {board.processors - 1}; choose one of them, or correct "
         f"`processors:` in group_vars/board_{board.name}.yml"
+    ]
+
+
+def interrupt_priorities() -> dict[str, int]:
+    """Priorities of interrupt threads on robots, by the pattern of their names."""
+    lines = (paths.OVERLAY / "etc/flotilla/irq-priorities").read_text(encoding="utf-8").splitlines()
+    return {(words := line.split())[0]: int(words[1]) for line in lines if line and not line.startswith("#")}
+
+
+def _problems_of_priority(task: object) -> list[str]:
+    """A thread waits for others of its priority: an interrupt's would wait for each step."""
+    priority = task.get("priority") if isinstance(task, dict) else None
+    if not isinstance(priority, int) or not (
+        same := [pattern for pattern, value in interrupt_priorities().items() if value == priority]
+    ):
+        return []
+    return [
+        f"priority: {priority}: threads of interrupts have it, too ({', '.join(same)}), and would wait for each step; "
+        f"take {priority - 1}, or for short steps {priority + 1}"
     ]
 
 

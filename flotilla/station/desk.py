@@ -554,5 +554,6 @@ def _task(state: State) -> dict[str, Any]:
         "sensors": status.flags if status else {},
         "refusals": status.refusals if status else "",
         "waiting": ", ".join(status.waiting) if status else "",
+        "lost": status.lost if status else "",
         "period_ms": status and 1000 * status.period_s,
     }

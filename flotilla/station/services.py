@@ -49,6 +49,13 @@ class TaskStatus:
     so."""
     waiting: list[str] = field(default_factory=list)
     """Actuators that do not act until a command was off, because the task was started since."""
+    serial_overruns: dict[str, int] = field(default_factory=dict)
+    """By block, how often its serial port has lost bytes."""
+
+    @property
+    def lost(self) -> str:
+        """`12 at gyro, 1 at compass`; empty: no serial port has lost bytes."""
+        return ", ".join(f"{count} at {block}" for block, count in self.serial_overruns.items())
 
     @property
     def refusals(self) -> str:
@@ -165,6 +172,7 @@ def _status_of(report: dict[str, Any], past: TaskStatus | None) -> TaskStatus:
             for block, kinds in report.get("refused", {}).items()
         },
         waiting=[str(block) for block in report.get("waiting", [])],
+        serial_overruns={str(block): int(count) for block, count in report.get("serial_overruns", {}).items()},
     )
 
 

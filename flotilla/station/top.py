@@ -236,6 +236,11 @@ class Top:
             for (robot, task), state in self._states.items()
             if state.status and state.status.waiting
         ]
+        notes += [
+            f"{robot}: {task} has serial overruns, bytes were lost: {state.status.lost}"
+            for (robot, task), state in self._states.items()
+            if state.status and state.status.lost
+        ]
         for stream in self._known:
             row, count = self._stats[stream.topic].row(now_ns), self._receiver.counts[stream.topic]
             if row.refusals and not _says(self._states.get((stream.robot, stream.task)), row.attempts):

@@ -1,11 +1,14 @@
 /* Serial ports: settings, and the thread that turns bytes into stamped measurements. */
 #define _GNU_SOURCE
+#include "service.h"
+
 #include <asm/termbits.h> /* termios2 allows any rate, not only those of POSIX; it conflicts with termios.h of the C library */
 #include <errno.h>
 #include <fcntl.h>
 #include <flotilla/driver.h>
 #include <inttypes.h>
 #include <limits.h>
+#include <linux/serial.h>
 #include <poll.h>
 #include <stdatomic.h>
 #include <stdlib.h>
@@ -24,6 +27,7 @@ enum {
     STUCK_MS = 1000,  /* a port that accepts no bytes for this long is opened again */
     CLOSING_MS = 500, /* for sending the rest when the thread has to return */
     BATCH = 256,
+    COUNTING_MS = 1000,  /* between two looks at what the port has lost */
     RATE_TOLERANCE = 50, /* 1/50: two UARTs may differ by some 4 % over a character; this is half of it */
 };
 
@@ -58,8 +62,10 @@ struct fl_serial {
     uint32_t sequence;
     int open_error; /* the last error that was logged */
     struct fl_reasons reasons;
-    int64_t judged_ns; /* when the last measurement or reason came */
-    bool received;     /* bytes came since then */
+    int64_t judged_ns;  /* when the last measurement or reason came */
+    bool received;      /* bytes came since then */
+    int64_t counted_ns; /* when the port was last asked what it has lost */
+    struct serial_icounter_struct counts;
     _Atomic bool connected;
 };
 
@@ -239,6 +245,31 @@ static void judge(struct fl_serial *serial, size_t bytes, unsigned measurements)
     }
 }
 
+/* Count, and log, bytes that were lost before they could be read. Ports that count none, such as pseudo terminals, have
+ * lost none. */
+static void count_lost(struct fl_serial *serial, int fd)
+{
+    static const char cause[] = "a thread of higher priority runs for too long, or interrupts are off";
+    const struct serial_icounter_struct before = serial->counts;
+    const int64_t now_ns = fl_now_ns();
+    if (now_ns - serial->counted_ns < COUNTING_MS * INT64_C(1000000))
+        return;
+    serial->counted_ns = now_ns;
+    if (ioctl(fd, TIOCGICOUNT, &serial->counts) < 0)
+        return;
+    const uint32_t overruns = (uint32_t)serial->counts.overrun - (uint32_t)before.overrun;
+    const uint32_t full = (uint32_t)serial->counts.buf_overrun - (uint32_t)before.buf_overrun;
+    atomic_fetch_add_explicit(&serial->block->service->lost, overruns + full, memory_order_relaxed);
+    if (overruns)
+        fl_reasons_log(&serial->reasons, serial->block, now_ns,
+                       "%s: bytes were lost in the UART (overrun), because its interrupt was served too late: %s",
+                       serial->settings.device, cause);
+    if (full)
+        fl_reasons_log(&serial->reasons, serial->block, now_ns,
+                       "%s: bytes were lost in the kernel's buffer (overrun), which was read too late: %s",
+                       serial->settings.device, cause);
+}
+
 /* Serve an open port until the thread has to return (0), or the device is gone or stuck (an errno). */
 static int converse(struct fl_serial *serial, const struct fl_driver *driver, int fd)
 {
@@ -246,6 +277,9 @@ static int converse(struct fl_serial *serial, const struct fl_driver *driver, in
     memset(serial->parser, 0, serial->protocol->parser_size);
     serial->judged_ns = received_ns;
     serial->received = false;
+    serial->counted_ns = received_ns;
+    if (ioctl(fd, TIOCGICOUNT, &serial->counts) < 0)
+        memset(&serial->counts, 0, sizeof serial->counts);
     int error = send_request(serial, driver, fd, FL_SERIAL_OPENED);
     while (!error) {
         uint8_t bytes[BATCH];
@@ -263,6 +297,7 @@ static int converse(struct fl_serial *serial, const struct fl_driver *driver, in
             received_ns = fl_now_ns();
         }
         judge(serial, count > 0 ? (size_t)count : 0, measurements);
+        count_lost(serial, fd);
         int64_t silent_ms = ready > 0 ? 0 : (fl_now_ns() - received_ns) / 1000000;
         error = send_request(serial, driver, fd, silent_ms < INT_MAX ? (int)silent_ms : INT_MAX);
         if (!error)

@@ -35,6 +35,7 @@ struct fl_service {
     bool *wired;                    /* which inputs are */
     bool *given;                    /* which parameters the task file sets */
     struct fl_bounds *bounds;       /* of each parameter while the task runs */
+    _Atomic uint32_t lost;          /* how often the block's serial port has lost bytes (an overrun) */
     int priority;                   /* SCHED_FIFO of the block's threads; 0: ordinary */
     int patience_ms;                /* how long to wait for a device that another process holds */
     int claim_fd;                   /* holds the block's device (device.h); below 1: none */

@@ -37,6 +37,14 @@ int fl_inner_result(const struct fl_block *outer)
     return outer->service->inner_failed ? FL_FAILED : FL_OK;
 }
 
+uint32_t inner_lost(const struct fl_block *outer)
+{
+    uint32_t lost = atomic_load_explicit(&outer->service->lost, memory_order_relaxed);
+    for (const struct fl_inner *inner = outer->service->inner; inner; inner = inner->next)
+        lost += inner->block ? inner_lost(inner->block) : 0;
+    return lost;
+}
+
 bool inner_waits(const struct fl_block *outer)
 {
     bool waits = atomic_load_explicit(&outer->service->wait, memory_order_relaxed) == FL_WAITS;

@@ -76,6 +76,14 @@ static bool runs(const struct rate *rate)
     return atomic_load_explicit(&rate->running, memory_order_acquire);
 }
 
+int rates_priority(int drivers, uint32_t place)
+{
+    const int first = drivers < RATES_BELOW ? drivers - 1 : RATES_BELOW - 1;
+    if (!drivers)
+        return 0;
+    return place < (uint32_t)first ? first - (int)place : -1;
+}
+
 int fl_rates_start(struct fl_block *block, const struct fl_rate *rates, uint32_t count)
 {
     const int below = block->service->priority; /* that of drivers */
@@ -83,13 +91,13 @@ int fl_rates_start(struct fl_block *block, const struct fl_rate *rates, uint32_t
     if (!made)
         return FL_FAILED;
     made->count = count;
-    if (below && below <= (int)count)
+    if (rates_priority(below, count - 1) < 0)
         return fl_fail(block, "%u slower rates need a priority each below the task's, which is %d; give it %u or more",
                        (unsigned)count, below + 1, (unsigned)count + 2);
     block->service->rates = made;
     for (uint32_t i = 0; i < count; i++) {
         struct rate *rate = &made->each[i];
-        struct fl_service service = {.priority = below ? below - 1 - (int)i : 0};
+        struct fl_service service = {.priority = rates_priority(below, i)};
         rate->rate = &rates[i];
         rate->block = block;
         sem_init(&rate->released, 0, 0);

@@ -5,6 +5,13 @@
 #include <flotilla/rates.h>
 #include <stdio.h>
 
+/* Slower rates run below the threads of interrupts that serve serial ports, CAN and the network: the least priority of
+ * these in /etc/flotilla/irq-priorities. A rate computes for tens of ms, and a UART holds what comes in one. */
+enum { RATES_BELOW = 60 };
+
+/* The priority of a rate by its place, where drivers have `drivers`. 0: ordinary; negative: there is none left. */
+int rates_priority(int drivers, uint32_t place);
+
 /* Bring the threads of a block's rates to the processor of the calling thread, which must stay there. 0 or an errno.
  * Nothing happens where there are none. */
 int rates_gather(const struct fl_block *block);

@@ -200,6 +200,21 @@ static void write_waiting(const struct status *status, bool json, FILE *out)
         fputc('\n', out);
 }
 
+/* The blocks whose serial ports have lost bytes. */
+static void write_lost(const struct status *status, bool json, FILE *out)
+{
+    bool any = false;
+    for (size_t i = 0; i < status->task->count; i++) {
+        const struct fl_block *block = status->task->blocks[i].block;
+        const uint32_t lost = inner_lost(block);
+        if (!lost)
+            continue;
+        fprintf(out, json ? "%s\"%s\": %" PRIu32 : "%sserial overruns of %s: %" PRIu32 "\n", json && any ? ", " : "",
+                block->name, lost);
+        any = true;
+    }
+}
+
 /* The counts that are not 0, those of a block together; what stands around names depends on `json`. */
 static void write_refusals(const struct status *status, const struct reading *reading, bool json, FILE *out)
 {
@@ -241,6 +256,8 @@ static void write_json(const struct status *status, const struct reading *readin
                 reading->sensors[i].flag ? "true" : "false", (double)reading->sensors[i].age);
     fputs("}, \"refused\": {", out);
     write_refusals(status, reading, true, out);
+    fputs("}, \"serial_overruns\": {", out);
+    write_lost(status, true, out);
     fputs("}, \"waiting\": [", out);
     write_waiting(status, true, out);
     fputs("]}\n", out);
@@ -260,6 +277,7 @@ static void write_text(const struct status *status, const struct reading *readin
                 (double)reading->sensors[i].age);
     write_waiting(status, false, out);
     write_refusals(status, reading, false, out);
+    write_lost(status, false, out);
 }
 
 void status_write(const struct status *status, bool json, FILE *out)

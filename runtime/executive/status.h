@@ -5,7 +5,8 @@
  *     {"task": "heading", "period_s": 0.01, "running_s": 75.21, "steps": 7521, "overruns": 3, "skipped": 4,
  *      "timeouts": 0, "last_overrun": {"step": 5000, "ago_s": 25.2, "late_s": 0.0012},
  *      "sensors": {"gyro": {"flag": true, "age_s": 0.004}},
- *      "refused": {"wrench": {"refused": 5, "forged": 410, "replayed": 206}}}
+ *      "refused": {"wrench": {"refused": 5, "forged": 410, "replayed": 206}},
+ *      "serial_overruns": {"gyro": 12}, "waiting": ["relays"]}
  *
  *   running_s     since the first step was prepared; all counts begin there
  *   overruns      steps that ended after the next one was due; they led to `skipped` releases without a step
@@ -13,6 +14,8 @@
  *   last_overrun  null: there was none; `late_s`: how long after the next one was due the step ended
  *   sensors       all blocks with the outputs that flotilla/sensor.h defines, of plug-ins too
  *   refused       by block, the outputs with FL_REFUSALS that are not 0, of plug-ins too
+ *   serial_overruns  by block, how often its serial port has lost bytes, if ever: in the UART or in the kernel's buffer
+ *   waiting       actuators that wait for a command that is off
  */
 #ifndef FLOTILLA_STATUS_H
 #define FLOTILLA_STATUS_H

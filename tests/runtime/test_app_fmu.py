@@ -677,7 +677,7 @@ def test_the_new_app_as_robots_get_it(fleet: Fleet, flotilla_run: Path, tmp_path
         built[board.architecture] = heads
     assert built == {"i386": {1}, "amd64": {2}}
     (out,) = (tmp_path / board.name for board in fleet.boards.values() if board.architecture == "amd64")
-    task = (out / app.TASK).read_text().replace("priority: 70", "priority: 0")
+    task = (out / app.TASK).read_text().replace("priority: 64", "priority: 0")
     rows = run(flotilla_run, out / "blocks", task, watch="plant.y")
     y = 0.0
     for row in rows:

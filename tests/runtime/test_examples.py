@@ -20,7 +20,7 @@ EXAMPLES = paths.PROJECT / "examples"
 def run(flotilla_run: Path, task: Path, blocks: Path, steps: int, signal: str) -> list[float]:
     """What a signal is in each step, where time is counted."""
     file = blocks / "task.yml"
-    file.write_text(task.read_text().replace("priority: 70", "priority: 0"))
+    file.write_text(task.read_text().replace("priority: 64", "priority: 0"))
     argv = [
         str(flotilla_run),
         "--blocks",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -303,3 +304,46 @@ def test_laser_scanner_as_it_was_left(
             else:
                 check_scan(row)
             assert device.baud == 115200
+
+
+LOSING = """
+#include <linux/serial.h>
+#include <stdarg.h>
+#include <sys/ioctl.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+int ioctl(int fd, unsigned long request, ...)
+{
+    static int asked;
+    va_list arguments;
+    va_start(arguments, request);
+    void *argument = va_arg(arguments, void *);
+    va_end(arguments);
+    if (request != TIOCGICOUNT)
+        return (int)syscall(SYS_ioctl, fd, request, argument);
+    *(struct serial_icounter_struct *)argument = (struct serial_icounter_struct){.overrun = 7 * ++asked};
+    return 0;
+}
+"""
+"""Emulates a UART that loses seven bytes before each look at its counts: neither a pty nor QEMU's UART loses any."""
+
+
+def test_bytes_that_a_port_loses_are_named(flotilla_run: Path, tmp_path: Path) -> None:
+    """Seen to fail: nothing asked for the counts, so the status said nothing, and a gyro with gaps looked broken."""
+    (tmp_path / "losing.c").write_text(LOSING)
+    shim = tmp_path / "losing.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", shim, tmp_path / "losing.c"], check=True)
+    text = "period: 10 ms\npriority: 0\nblocks:\n  gyro: {type: dsp3000, parameters: "
+    control = ["--control", str(tmp_path / "control")]
+    with SerialLine(gyro("text")) as line:
+        text += json.dumps({"device": line.path, **GYRO}) + "}\n"
+        argv: list[str | Path] = [flotilla_run, *control, "--watch", "gyro.flag,gyro.sequence"]
+        with running(argv, tmp_path / "losing.yml", text, {"LD_PRELOAD": str(shim)}) as run:
+            run.until(good)
+            asking: list[str | Path] = [flotilla_run.with_name("flotilla-param"), *control, "--status=json", "losing"]
+
+            def lost(_: Row) -> int:  # the port is asked once a second
+                said = subprocess.run(asking, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
+                return int(json.loads(said)["serial_overruns"].get("gyro", 0))
+
+            assert lost(run.until(lost)) % 7 == 0

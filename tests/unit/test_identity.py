@@ -289,3 +289,27 @@ def test_the_fleet_model_survives_a_round_trip(fleet: Fleet) -> None:
     again = Fleet.model_validate(json.loads(fleet.model_dump_json()))
     assert again.model_dump() == fleet.model_dump()
     assert {name: board.acceptance for name, board in again.boards.items()} == dict.fromkeys(fleet.boards, Acceptance())
+
+
+def test_rates_run_below_the_interrupts_that_serve_devices() -> None:
+    """A rate computes for tens of ms. Under a task with 80 they had 78 and less, above serial ports and CAN."""
+    served = [value for pattern, value in identity.interrupt_priorities().items() if "ata" not in pattern]
+    (below,) = re.findall(r"RATES_BELOW = (\d+)", (paths.PROJECT / "runtime/executive/rates.h").read_text())
+    assert int(below) == min(served)
+
+
+@pytest.mark.parametrize(("priority", "refused"), [(70, "irq/*-serial*, irq/*-ttyS*, tty-flip"), (65, "irq/*-can*")])
+def test_a_task_has_no_interrupts_priority(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, priority: int, refused: str
+) -> None:
+    """Seen to fail: `perceive` had that of its laser's interrupt, which waited for each of its steps."""
+    monkeypatch.setattr(paths, "TASKS", tmp_path)
+    robot = fleet.robots[3].model_copy(update={"control_tasks": ["slow"]})
+    text = "period: 100 ms\npriority: {}\nblocks: {{one: {{type: clock}}}}\n"
+    (tmp_path / "slow.yml").write_text(text.format(priority - 1))
+    identity.control_tasks(fleet, robot)
+    (tmp_path / "slow.yml").write_text(text.format(priority))
+    with pytest.raises(
+        UserError, match=re.escape(f"priority: {priority}: threads of interrupts have it, too ({refused})")
+    ):
+        identity.control_tasks(fleet, robot)

@@ -220,6 +220,17 @@ def test_an_actuator_that_waits_is_named() -> None:
     ]
 
 
+def test_serial_overruns_are_named() -> None:
+    """Bytes that a port loses are the robot's fault, and no device's."""
+    status = TaskStatus(0.01, 0, 0, {}, serial_overruns={"gyro": 12, "compass": 1})
+    still = State("running 5 s", True, TaskStatus(0.01, 0, 0, {}))
+    states = {("robot3", "heading"): State("running 5 s", True, status), ("robot3", "sensors"): still}
+    top = Top(Receiver([STREAM]), states, clock=lambda: 0)
+    assert [line.strip() for line in top.end().splitlines() if "were lost" in line] == [
+        "robot3: heading has serial overruns, bytes were lost: 12 at gyro, 1 at compass"
+    ]
+
+
 @pytest.mark.parametrize(
     ("refused", "said"),
     [

@@ -133,6 +133,8 @@ export class Fleet {
       if (refusals) parts.push([name, `refused ${refusals}`, false]);
       const waiting = state.tasks[`${robot.name} ${name}`]?.waiting;
       if (waiting) parts.push([name, `stopped since its start, switch off and on: ${waiting}`, true]);
+      const lost = state.tasks[`${robot.name} ${name}`]?.lost;
+      if (lost) parts.push([name, `serial overruns, bytes were lost: ${lost}`, true]);
     }
     for (const stream of own) {
       const attempts = state.streams[stream.topic].attempts;

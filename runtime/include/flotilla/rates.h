@@ -10,7 +10,8 @@
  *   terminate    fl_rates_stop, before anything that a rate uses goes
  *
  * With real-time priorities all rates have one processor, and the threads of slower rates run below the priority of
- * drivers, the slower the lower: a rate is only ever interrupted by faster ones, which generated code relies on.
+ * drivers and of interrupts, the slower the lower: of the block's code only faster rates interrupt one, which generated
+ * code relies on.
  * Otherwise (priority 0, refused, or --no-wait) no scheduler promises this, and fl_rates_release waits for each rate
  * that it releases.
  *

@@ -292,6 +292,20 @@ static void a_rate_that_hangs_ends_the_process(void **state)
     assert_ptr_equal(strstr(words, "flotilla: three-rates: slow did not end with the task, "), words);
 }
 
+/* Also under a task with 80, whose drivers have 79: serial ports have 70, CAN 65, the network 60. */
+static void rates_run_below_the_interrupts_of_devices(void **state)
+{
+    (void)state;
+    assert_int_equal(rates_priority(79, 0), 59);
+    assert_int_equal(rates_priority(79, 1), 58);
+    assert_int_equal(rates_priority(60, 0), 59);
+    assert_int_equal(rates_priority(50, 0), 49);
+    assert_int_equal(rates_priority(50, 48), 1);
+    assert_true(rates_priority(50, 49) < 0);
+    assert_true(rates_priority(1, 0) < 0);
+    assert_int_equal(rates_priority(0, 3), 0);
+}
+
 static void a_priority_without_room_below_is_refused(void **state)
 {
     (void)state;
@@ -311,6 +325,7 @@ int main(void)
         cmocka_unit_test(overruns_are_counted_and_the_release_is_left_out),
         cmocka_unit_test(as_many_in_a_row_as_permitted_end_the_task),
         cmocka_unit_test(a_rate_that_hangs_ends_the_process),
+        cmocka_unit_test(rates_run_below_the_interrupts_of_devices),
         cmocka_unit_test(a_priority_without_room_below_is_refused),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

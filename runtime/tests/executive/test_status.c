@@ -1,6 +1,7 @@
 #define _GNU_SOURCE
 #include "testbed.h"
 
+#include "core/service.h"
 #include "executive/block.h"
 #include "executive/status.h"
 
@@ -95,8 +96,8 @@ static void what_was_put_is_written(void **state)
     assert_non_null(strstr(line, "{\"task\": \"heading\", \"period_s\": 0.01, \"running_s\": 0."));
     assert_non_null(
         strstr(line, "\"steps\": 1, \"overruns\": 0, \"skipped\": 0, \"timeouts\": 4, \"last_overrun\": null"));
-    assert_non_null(strstr(
-        line, "\"sensors\": {\"gyro\": {\"flag\": false, \"age_s\": 0.250000}}, \"refused\": {}, \"waiting\": []}\n"));
+    assert_non_null(strstr(line, "\"sensors\": {\"gyro\": {\"flag\": false, \"age_s\": 0.250000}}, \"refused\": {}, "
+                                 "\"serial_overruns\": {}, \"waiting\": []}\n"));
 
     result = (struct run_result){.steps = 9, .overruns = 2, .skipped = 3, .last_overrun = {7, fl_now_ns(), 1500000}};
     set_sensor(true, 0.004);
@@ -138,15 +139,31 @@ static void what_was_refused_is_named(void **state)
     set_sensor(true, 0);
     set_refused(WRENCH, 0, 0);
     set_refused(STATE, 0, 0);
-    check_refused(status, "}, \"refused\": {}, \"waiting\": []}\n", "");
+    check_refused(status, "}, \"refused\": {}, \"serial_overruns\": {}, \"waiting\": []}\n", "");
     set_refused(STATE, 0, 410);
-    check_refused(status, "}, \"refused\": {\"state\": {\"forged\": 410}}, \"waiting\": []}\n",
+    check_refused(status, "}, \"refused\": {\"state\": {\"forged\": 410}}, \"serial_overruns\": {}, \"waiting\": []}\n",
                   "refused by state: 410 forged\n");
     set_refused(WRENCH, 5, UINT32_MAX);
     check_refused(status,
                   "}, \"refused\": {\"wrench\": {\"refused\": 5, \"forged\": 4294967295}, \"state\": {\"forged\": "
-                  "410}}, \"waiting\": []}\n",
+                  "410}}, \"serial_overruns\": {}, \"waiting\": []}\n",
                   "refused by wrench: 5 refused, 4294967295 forged\nrefused by state: 410 forged\n");
+    status_destroy(status);
+}
+
+static void what_serial_ports_lost_is_named(void **state)
+{
+    (void)state;
+    struct status *status = status_create(&task);
+    set_sensor(true, 0);
+    set_refused(WRENCH, 0, 0);
+    set_refused(STATE, 0, 0);
+    blocks[GYRO].block->service->lost = 12;
+    check_refused(status, "\"serial_overruns\": {\"gyro\": 12}, \"waiting\": []}\n", "serial overruns of gyro: 12\n");
+    blocks[CAMERA].block->service->lost = 1;
+    check_refused(status, "\"serial_overruns\": {\"camera\": 1, \"gyro\": 12}, ",
+                  "serial overruns of camera: 1\nserial overruns of gyro: 12\n");
+    blocks[GYRO].block->service->lost = blocks[CAMERA].block->service->lost = 0;
     status_destroy(status);
 }
 
@@ -200,8 +217,8 @@ static void a_reading_is_of_one_step(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = {cmocka_unit_test(what_was_put_is_written),
-                                       cmocka_unit_test(what_was_refused_is_named),
-                                       cmocka_unit_test(a_reading_is_of_one_step)};
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(what_was_put_is_written), cmocka_unit_test(what_was_refused_is_named),
+        cmocka_unit_test(what_serial_ports_lost_is_named), cmocka_unit_test(a_reading_is_of_one_step)};
     return cmocka_run_group_tests(tests, prepare, clear);
 }
