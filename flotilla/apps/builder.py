@@ -36,7 +36,7 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
     with cache.exclusive(), progress.step(f"{subject.name} for {board.system}"):
         (out / "unit.d").mkdir(parents=True)  # what the app's service has beyond runtime/systemd/
         description = subject.description
-        needs: privileges.Needs = {}
+        drives = False
         try:
             if isinstance(description, app.Make):
                 _make(subject, description, board.system, out, run)
@@ -48,53 +48,58 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
                     name = subject.name
                     defines = ert.block(subject.directory, model, name, times_s, source, board.system, tasking)
                     try:
-                        needs = _blocks(subject, source, ("-Wall", *defines), board.system, out, run)
+                        drives = _blocks(subject, source, ("-Wall", *defines), board.system, out, run)
                     except UserError as error:
                         raise ert.explained(error, board.system) from None
             elif isinstance(description, app.Fmu):
-                needs = _fmu(subject, description, board.system, out, run)
+                drives = _fmu(subject, description, board.system, out, run)
             else:
-                needs = _blocks(subject, subject.directory, runtime.WARNINGS, board.system, out, run)
-            _allow(description, needs, out)
+                drives = _blocks(subject, subject.directory, runtime.WARNINGS, board.system, out, run)
+            if drives or (isinstance(description, app.Make) and _drives(description, out)):
+                (out / "unit.d" / privileges.DROP_IN).write_text(privileges.IO_PORTS)
         except UserError as error:
             raise UserError(f"{paths.shown(subject.directory)}: nothing was built: {error}") from None
 
 
-def _allow(description: app.Description, needs: privileges.Needs, out: Path) -> None:
-    """The privileges that the app's service needs. `needs`: of the app's own blocks."""
-    tasks = [yaml.safe_load(task.read_text()) for name in (app.TASK, app.SAFE) if (task := out / name).exists()]
-    drives = any(privileges.drives_io_ports(task, needs) for task in tasks)
-    if drives or (isinstance(description, app.Make) and description.io_ports):
-        (out / "unit.d" / privileges.DROP_IN).write_text(privileges.IO_PORTS)
+def _drives(description: app.Make, out: Path) -> bool:
+    """Whether a program drives I/O ports, or what makes its outputs safe."""
+    safe = out / app.SAFE
+    return description.io_ports or (safe.exists() and privileges.drives_io_ports(yaml.safe_load(safe.read_text())))
+
+
+_INSIDE = re.compile(r'\bfl_inner_new\(\s*"([^"]+)"')
+"""How code begins a block within a block: a model with blocks of the runtime does."""
 
 
 def _blocks(
     subject: app.App, source: Path, options: Sequence[str], system: System, out: Path, run: toolchain.Run
-) -> privileges.Needs:
-    """The plug-in of all that is in `source`, and the task; the runtime judges both as the robot would. What the blocks
-    need, as they declare it."""
+) -> bool:
+    """The plug-in of all that is in `source`, and the task; the runtime judges both as the robot would. Whether its
+    blocks drive I/O ports, as they declare it."""
     task = subject.directory / app.TASK
+    inside: set[str] = set()
     needs: privileges.Needs = {}
     (out / "blocks").mkdir()
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".blocks-") as directory:
-        if any(path.parent == source and path.suffix == ".c" for path in sources.files(source)):
+        if files := [path for path in sources.files(source) if path.parent == source and path.suffix == ".c"]:
+            inside.update(*(_INSIDE.findall(path.read_text(errors="replace")) for path in files))
             plugin = runtime.compile_plugin(source, system, options, run)
             (out / "blocks" / f"{subject.name}.so").write_bytes(plugin)
             (Path(directory) / f"{subject.name}.so").write_bytes(plugin)
             needs = privileges.needs_of(runtime.check_plugins(Path(directory), system))
         runtime.check_task(task, task.read_bytes(), Path(directory), system)
     shutil.copyfile(task, out / app.TASK)
-    return needs
+    return privileges.drives_io_ports(yaml.safe_load(task.read_text()), needs, inside)
 
 
-def _fmu(subject: app.App, description: app.Fmu, system: System, out: Path, run: toolchain.Run) -> privileges.Needs:
+def _fmu(subject: app.App, description: app.Fmu, system: System, out: Path, run: toolchain.Run) -> bool:
     """The unit, and the plug-in that calls it."""
     with tempfile.TemporaryDirectory(dir=paths.BUILD, prefix=".fmu-") as work:
         unit = fmu.read(*fmu.unpacked(subject.directory, description.unit, Path(work) / "unit"))
         fmu.block(unit, subject.name, Path(work) / "source")
-        needs = _blocks(subject, Path(work) / "source", runtime.WARNINGS, system, out, run)
+        drives = _blocks(subject, Path(work) / "source", runtime.WARNINGS, system, out, run)
         fmu.build(unit, subject.name, system, out, run)
-        return needs
+        return drives
 
 
 def _make(subject: app.App, description: app.Make, system: System, out: Path, run: toolchain.Run) -> None:

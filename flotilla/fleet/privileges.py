@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -141,12 +141,14 @@ def shared_devices(descriptions: Mapping[str, object]) -> Iterator[tuple[str, st
                 yield name, f"{DEVICES}{device} is open in {other} too: read it in one task, and send what it says"
 
 
-def drives_io_ports(description: object, needs: Needs | None = None) -> bool:
+def drives_io_ports(description: object, needs: Needs | None = None, inside: Collection[str] = ()) -> bool:
     """Whether a task, as parsed, has a block that does. What is no task in other ways is the runtime's to say.
 
-    `needs`: of blocks that the runtime does not have.
+    `needs`: of blocks that the runtime does not have. `inside`: types of blocks that these contain.
     """
-    return any(need.what == "io-ports" for _, _, need in _needed(description, {**runtime_needs(), **(needs or {})}))
+    contained = {"blocks": {name: {"type": name} for name in inside}}
+    known = {**runtime_needs(), **(needs or {})}
+    return any(need.what == "io-ports" for each in (description, contained) for _, _, need in _needed(each, known))
 
 
 def _name(number: int) -> str:
