@@ -101,8 +101,10 @@ static void terminate_blocks(struct task *task)
     for (size_t i = task->count; i-- > 0;) {
         struct task_block *task_block = &task->blocks[i];
         safety_running = task_block->block;
-        if (task_block->started && task_block->block->type->terminate)
+        if (task_block->started && task_block->block->type->terminate) {
+            safety_terminates(task_block->block);
             task_block->block->type->terminate(task_block->block);
+        }
         task_block->started = false;
     }
 }

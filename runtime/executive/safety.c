@@ -19,6 +19,7 @@
 
 enum {
     LIMIT_S = 1,              /* from the first `safe` to the end of the process */
+    TERMINATE_S = 10,         /* for `terminate` of a block, which may write files; a service has less */
     PARK_NS = 20 * 1000000,   /* a thread that waits in the kernel cannot be parked, nor can it run a step */
     PARK_POLL_NS = 50 * 1000, /* on one processor the thread gets it meanwhile */
 };
@@ -44,6 +45,7 @@ static struct {
     timer_t limit;
     _Atomic size_t left; /* blocks whose `safe` was not called yet */
     _Atomic pid_t stepping, stopping;
+    _Atomic(const struct fl_block *) terminating;
     _Atomic bool parked;
 } safety;
 
@@ -69,6 +71,7 @@ static void stop_outputs(void)
     if (!atomic_compare_exchange_strong(&safety.stopping, &nobody, self) && nobody != self)
         for (;;)
             pause(); /* the other thread ends the process */
+    atomic_store(&safety.terminating, NULL);
     timer_settime(safety.limit, 0, &(struct itimerspec){.it_value.tv_sec = LIMIT_S}, NULL);
     park_stepping(self);
     while (atomic_load(&safety.left)) {
@@ -190,7 +193,10 @@ static void handle(int number, siginfo_t *info, void *context)
 {
     const struct fl_block *running = safety_running;
     if (number == OWN_SIGNAL && info->si_code == SI_TIMER) {
-        _exit(say_outcome("flotilla: the end took too long; ") ? 1 : SAFETY_UNKNOWN);
+        const struct fl_block *block = atomic_load(&safety.terminating);
+        say("flotilla: ");
+        say(block ? block->name : "the end");
+        _exit(say_outcome(block ? " does not end; " : " took too long; ") ? 1 : SAFETY_UNKNOWN);
     }
     if (number == OWN_SIGNAL && info->si_code == SI_TKILL && gettid() == atomic_load(&safety.stepping)) {
         atomic_store(&safety.parked, true);
@@ -243,6 +249,7 @@ void safety_begin(struct task *task)
     registered = true;
     safety.process = getpid();
     atomic_store(&safety.left, task->count);
+    atomic_store(&safety.terminating, NULL);
     atomic_store(&safety.task, task);
     catch_signals();
 }
@@ -251,6 +258,14 @@ void safety_end(void)
 {
     atomic_store(&safety.task, NULL);
     timer_delete(safety.limit);
+}
+
+void safety_terminates(const struct fl_block *block)
+{
+    if (!atomic_load(&safety.task) || atomic_load(&safety.stopping)) /* it never ran, or its last second has begun */
+        return;
+    atomic_store(&safety.terminating, block);
+    timer_settime(safety.limit, 0, &(struct itimerspec){.it_value.tv_sec = TERMINATE_S}, NULL);
 }
 
 void safety_step_begin(void)

@@ -31,6 +31,9 @@ extern _Thread_local const struct fl_block *safety_running;
 void safety_step_begin(void);
 void safety_step_end(void);
 
+/* `terminate` of a block begins, which has started: the process ends if it takes too long. Outputs are safe by then. */
+void safety_terminates(const struct fl_block *block);
+
 /* Call `safe` of a block that has started and has one. */
 void safety_reset(const struct task_block *task_block);
 

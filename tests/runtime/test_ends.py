@@ -62,6 +62,14 @@ def test_what_a_block_does_wrong_ends_with_outputs_reset(tasks: Tasks, tmp_path:
     assert words[-1] == ("safe" if "hang" in bad.manner else "terminated")
 
 
+def test_a_block_that_does_not_terminate_is_named_and_the_process_ends(tasks: Tasks, tmp_path: Path) -> None:
+    """Seen to fail: the process stayed for ever, unless a service manager killed it."""
+    out = f"out: {{type: trace, parameters: {{device: {tmp_path / 'device'}}}}}\n"
+    ended = tasks.run(task(out + "bad: {type: misbehave, parameters: {manner: terminate-hang}}"), "--steps", "3")
+    assert ended.status == 1
+    assert "flotilla: bad does not end; outputs are in their reset state\n" in ended.err
+
+
 def test_a_hang_ends_within_the_shortest_time_out_of_the_actuators(tasks: Tasks, tmp_path: Path) -> None:
     """A second thread counts the second that a hang lasted on at least. Seen to fail: `second` before `safe`."""
     device = tmp_path / "device"

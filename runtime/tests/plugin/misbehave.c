@@ -20,7 +20,7 @@ struct misbehave {
 static const struct fl_parameter misbehave_parameters[] = {
     FL_PARAMETER(struct misbehave, manner,
                  .choices = "fail|hang|late|allocate|start-fail|fault|abort|exit|"
-                            "overflow|thread-fault|thread-exit|safe-fault|safe-hang|safe-not"),
+                            "overflow|thread-fault|thread-exit|safe-fault|safe-hang|safe-not|terminate-hang"),
     FL_PARAMETER(struct misbehave, from, .default_value = "0"),
     FL_PARAMETER(struct misbehave, until, .default_value = "1000000000"),
     FL_PARAMETER(struct misbehave, late_s, .default_value = "0.025"),
@@ -41,6 +41,7 @@ enum {
     SAFE_FAULT, /* a fault in the step, and another in what follows */
     SAFE_HANG,
     SAFE_NOT, /* and its step fails */
+    TERMINATE_HANG,
 };
 
 struct misbehaving {
@@ -98,7 +99,10 @@ static void misbehave_safe(struct fl_block *block)
 
 static void misbehave_terminate(struct fl_block *block)
 {
+    const struct misbehave *parameters = block->parameters;
     const struct misbehaving *state = block->state;
+    while (parameters->manner == TERMINATE_HANG)
+        pause();
     fl_driver_stop(state->driver);
 }
 
@@ -129,6 +133,8 @@ static int misbehave_step(struct fl_block *block)
     case THREAD_FAULT:
     case THREAD_EXIT:
         state->now = true;
+        return FL_OK;
+    case TERMINATE_HANG:
         return FL_OK;
     case ALLOCATE: {
         void *volatile memory = malloc(100);
