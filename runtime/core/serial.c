@@ -1,5 +1,6 @@
 /* Serial ports: settings, and the thread that turns bytes into stamped measurements. */
 #define _GNU_SOURCE
+#include "newest.h"
 #include "service.h"
 
 #include <asm/termbits.h> /* termios2 allows any rate, not only those of POSIX; it conflicts with termios.h of the C library */
@@ -42,10 +43,6 @@ struct sending {
     uint8_t bytes[SEND_BYTES];
 };
 
-/* Hands over the newest measurement without waiting. The thread owns one slot, the step another, and each swaps its own
- * for the third. A ring would drop the newest measurement once a slow step has let it fill up. */
-enum { SLOTS = 3, FRESH = 4 };
-
 struct fl_serial {
     struct fl_block *block;
     const struct fl_serial_protocol *protocol;
@@ -53,9 +50,8 @@ struct fl_serial {
     const void *parameters;
     struct fl_driver *driver;
     struct fl_ring arrivals, sendings;
-    struct arrival *slots[SLOTS], *taken;
-    unsigned writing, reading; /* slots of the thread and of the step */
-    _Atomic unsigned middle;   /* the third slot, with FRESH until the step has swapped it */
+    struct newest newest; /* of struct arrival */
+    struct arrival *taken;
     void *parser;
     int64_t baud;        /* that the port is set to */
     int64_t close_by_ns; /* 0: the thread need not return yet */
@@ -209,7 +205,7 @@ static unsigned feed(struct fl_serial *serial, const uint8_t *bytes, size_t coun
     int64_t now_ns = fl_now_ns();
     unsigned measurements = 0;
     for (size_t at = 0; at < count; at++) {
-        struct arrival *arrival = serial->slots[serial->writing];
+        struct arrival *arrival = newest_back(&serial->newest);
         if (!serial->protocol->feed(serial->parser, bytes[at], arrival->sample))
             continue;
         measurements++;
@@ -218,7 +214,7 @@ static unsigned feed(struct fl_serial *serial, const uint8_t *bytes, size_t coun
         if (serial->protocol->records)
             fl_ring_put(&serial->arrivals, arrival);
         else
-            serial->writing = atomic_exchange(&serial->middle, serial->writing | FRESH) & ~(unsigned)FRESH;
+            newest_put(&serial->newest);
     }
     return measurements;
 }
@@ -377,14 +373,8 @@ struct fl_serial *fl_serial_start(struct fl_block *block, const struct fl_serial
     serial->parameters = parameters;
     serial->parser = fl_allocate(block, protocol->parser_size);
     serial->taken = fl_allocate(block, record);
-    for (unsigned slot = 0; slot < SLOTS; slot++)
-        if (!(serial->slots[slot] = fl_allocate(block, record)))
-            return NULL;
-    if (!serial->parser || !serial->taken)
+    if (!serial->parser || !serial->taken || newest_allocate(&serial->newest, block, record) != FL_OK)
         return NULL;
-    serial->writing = 0;
-    serial->reading = 1;
-    atomic_init(&serial->middle, 2);
     fl_ring_initialize(&serial->arrivals, arrivals, record, protocol->records);
     fl_ring_initialize(&serial->sendings, sendings, sizeof(struct sending), SENDABLE);
     serial->driver = fl_driver_start(block, run, serial);
@@ -418,11 +408,10 @@ bool fl_serial_newest(struct fl_serial *serial, void *sample, int64_t *arrived_n
     }
     if (serial->protocol->records)
         return any;
-    if (!(atomic_load(&serial->middle) & FRESH))
-        return false;
-    serial->reading = atomic_exchange(&serial->middle, serial->reading) & ~(unsigned)FRESH;
-    hand_over(serial, serial->slots[serial->reading], sample, arrived_ns, sequence);
-    return true;
+    const struct arrival *arrival = newest_take(&serial->newest);
+    if (arrival)
+        hand_over(serial, arrival, sample, arrived_ns, sequence);
+    return arrival;
 }
 
 bool fl_serial_connected(const struct fl_serial *serial)

@@ -101,7 +101,7 @@ static bool prepare(int fd, const void *context)
     const struct sock_fprog program = {filter.count, filter.code};
     /* The new time stamp has 64 bits on i386 too. */
     return setsockopt(fd, SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program) == 0 &&
-           setsockopt(fd, SOL_SOCKET, SO_TIMESTAMPNS_NEW, &on, sizeof on) == 0;
+           setsockopt(fd, SOL_SOCKET, SO_TIMESTAMPNS_NEW, &on, sizeof on) == 0 && socket_bound_queue(fd);
 }
 
 int udp_receiver_check(struct fl_block *block, const char *local_address, struct fl_strings from)
@@ -213,13 +213,13 @@ static bool authentic(struct udp_receiver *receiver, size_t rank, const struct s
 
 struct udp_budget udp_budget_of(const struct fl_block *block)
 {
-    return (struct udp_budget){UDP_BURST, fl_now_ns() + block->period_ns / UDP_REFUSING};
+    return (struct udp_budget){SOCKET_BURST, fl_now_ns() + block->period_ns / UDP_REFUSING};
 }
 
 bool udp_receive(struct udp_receiver *receiver, void *bytes, int64_t *arrived_ns, struct udp_budget *budget)
 {
     int64_t now_ns = 0;
-    if (budget->datagrams == UDP_BURST)
+    if (budget->datagrams == SOCKET_BURST)
         count_lost(receiver);
     while (budget->datagrams-- > 0 && now_ns < budget->until_ns) {
         _Alignas(struct cmsghdr) char control[CMSG_SPACE(sizeof(struct __kernel_timespec))];

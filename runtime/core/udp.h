@@ -3,13 +3,12 @@
 #define FLOTILLA_CORE_UDP_H
 
 #include "authentication.h"
+#include "socket_queue.h"
 #include "udp_sockets.h"
 
 enum {
     /* The payload of one Ethernet or 802.11 frame: a fragmented datagram is lost with any of its fragments. */
     UDP_LONGEST = 1500 - 20 - 8,
-    /* Most datagrams that one step takes, so that a flood does not delay it. */
-    UDP_BURST = 64,
     /* Of a step's period, one part in so many goes to datagrams that are refused: to find out costs more than to take
      * one, and who floods a fast task chooses what costs most. */
     UDP_REFUSING = 4,

@@ -27,21 +27,30 @@ int grabber_start(struct fl_block *block, struct grabber *grabber, int64_t width
     grabber->block = block;
     grabber->bytes = (size_t)(width * height);
     fl_sensor_begin(&grabber->sensor);
-    if (frames_allocate(block, &grabber->frames, grabber->bytes) != FL_OK)
+    if (newest_allocate(&grabber->frames, block, sizeof(struct frame) + grabber->bytes) != FL_OK)
         return FL_FAILED;
     grabber->driver = fl_driver_start(block, run, grabber);
     return grabber->driver ? FL_OK : FL_FAILED;
 }
 
+uint8_t *grabber_pixels(struct grabber *grabber)
+{
+    struct frame *frame = newest_back(&grabber->frames);
+    return frame->pixels;
+}
+
 void grabber_publish(struct grabber *grabber, int64_t at_ns)
 {
-    frames_publish(&grabber->frames, at_ns);
+    struct frame *frame = newest_back(&grabber->frames);
+    frame->at_ns = at_ns;
+    frame->sequence = ++grabber->published;
+    newest_put(&grabber->frames);
     fl_reasons_good(&grabber->reasons, fl_now_ns());
 }
 
 void grabber_step(struct fl_block *block, struct grabber *grabber, double timeout)
 {
-    const struct frame *frame = frames_newest(&grabber->frames);
+    const struct frame *frame = newest_take(&grabber->frames);
     if (frame) {
         memcpy(block->out[IMAGE], frame->pixels, grabber->bytes);
         fl_sensor_update(&grabber->sensor, frame->at_ns, frame->sequence);

@@ -7,7 +7,7 @@
 #ifndef FLOTILLA_CAMERA_GRABBER_H
 #define FLOTILLA_CAMERA_GRABBER_H
 
-#include "frames.h"
+#include "core/newest.h"
 
 #include <flotilla/driver.h>
 #include <flotilla/sensor.h>
@@ -25,8 +25,15 @@ enum { GRABBER_SIDE = 2048 }; /* largest width and height: 12 MiB of buffers at 
                      .summary = "of the image"),                                                                       \
         FL_SENSOR_TIMEOUT(type, "0.5")
 
+struct frame {
+    int64_t at_ns;     /* when it was taken, CLOCK_MONOTONIC */
+    uint32_t sequence; /* frames so far, this one included */
+    uint8_t pixels[];
+};
+
 struct grabber {
-    struct frames frames;
+    struct newest frames;
+    uint32_t published; /* frames so far; the thread's */
     struct fl_driver *driver;
     const void *parameters;
     size_t bytes;
@@ -39,7 +46,10 @@ struct grabber {
 /* Log why there are no images, once (fl_reasons_log). For the thread. */
 #define GRABBER_TELL(grabber, ...) fl_reasons_log(&(grabber)->reasons, (grabber)->block, fl_now_ns(), __VA_ARGS__)
 
-/* For the thread: hand over the frame of frames_back(), and note that the camera is good. */
+/* For the thread: where the next frame goes. */
+uint8_t *grabber_pixels(struct grabber *grabber);
+
+/* For the thread: hand over that frame, and note that the camera is good. */
 void grabber_publish(struct grabber *grabber, int64_t at_ns);
 
 /* Add the outputs image, flag, age and sequence. */

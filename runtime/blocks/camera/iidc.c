@@ -159,7 +159,7 @@ static bool take(dc1394camera_t *camera, struct grabber *grabber)
     if (!frame)
         return true;
     if (fits(camera, frame, set)) {
-        uint8_t *to = frames_back(&grabber->frames);
+        uint8_t *to = grabber_pixels(grabber);
         for (size_t row = 0; row < frame->size[1]; row++)
             memcpy(to + row * frame->size[0], frame->image + row * frame->stride, frame->size[0]);
         grabber_publish(grabber, taken_ns(frame));

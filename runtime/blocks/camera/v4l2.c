@@ -251,7 +251,7 @@ static bool take(struct stream *stream, struct grabber *grabber)
     if (buffer.index >= stream->count)
         return false;
     if (complete(stream, &buffer)) {
-        convert(stream, stream->buffers[buffer.index].start, frames_back(&grabber->frames));
+        convert(stream, stream->buffers[buffer.index].start, grabber_pixels(grabber));
         grabber_publish(grabber, taken_ns(&buffer));
     } else {
         GRABBER_TELL(grabber, "an image is incomplete: check the cable");

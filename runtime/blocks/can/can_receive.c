@@ -1,7 +1,7 @@
 /** can-receive
  *
  * Receives the newest data frame of an identifier, or of several by `mask`, on a CAN bus. Frames are stamped by the
- * kernel. A step takes 256 frames at most.
+ * kernel. A step takes all that wait, which are about 300.
  *
  * Failure: The flag is 0 once no frame came for `timeout`, and while the interface is missing or down, or the
  * controller has left the bus. While the flag is 0 the values stay the last good ones, and `age` grows. The block
@@ -69,12 +69,11 @@ static int start(struct fl_block *block)
 
 static int step(struct fl_block *block)
 {
-    enum { FRAMES = 256 }; /* of one step: more would be a bus at 1 Mbit/s with a step each 30 ms */
     const struct can_receive *set = block->parameters;
     struct received *received = block->state;
     struct can_frame frame;
     int64_t arrived_ns;
-    for (int i = 0; i < FRAMES && can_receive(&received->can, &frame, &arrived_ns); i++) {
+    for (int i = 0; i < SOCKET_BURST && can_receive(&received->can, &frame, &arrived_ns); i++) {
         memset(block->out[DATA], 0, CAN_MAX_DLEN);
         memcpy(block->out[DATA], frame.data, frame.len);
         FL_OUT(block, LENGTH, uint8_t) = frame.len;

@@ -307,12 +307,11 @@ static void follow_interface(struct state *state)
 
 static int step(struct fl_block *block)
 {
-    enum { FRAMES = 64 }; /* of one step, so that it ends: a dozen are usual */
     const struct epos2_block *set = block->parameters;
     struct state *state = block->state;
     struct can_frame frame, out[EPOS2_FRAMES];
     int64_t arrived_ns;
-    for (int i = 0; i < FRAMES && can_receive(&state->can, &frame, &arrived_ns); i++)
+    for (int i = 0; i < SOCKET_BURST && can_receive(&state->can, &frame, &arrived_ns); i++)
         epos2_receive(&state->drive, &frame, arrived_ns);
     bool fresh = FL_IN(block, COMMAND_AGE, double) <= set->timeout, enable = FL_IN(block, ENABLE, uint8_t);
     bool commanded = fresh && (!fl_wired(block, COMMAND_FLAG) || FL_IN(block, COMMAND_FLAG, bool));

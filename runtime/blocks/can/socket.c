@@ -35,7 +35,7 @@ static int open_socket(struct can_socket *can)
     if (setsockopt(fd, SOL_CAN_RAW, CAN_RAW_FILTER, can->filters,
                    (socklen_t)(can->filter_count * sizeof *can->filters)) < 0 ||
         setsockopt(fd, SOL_CAN_RAW, CAN_RAW_ERR_FILTER, &reports, sizeof reports) < 0 ||
-        setsockopt(fd, SOL_SOCKET, SO_TIMESTAMPNS, &on, sizeof on) < 0) {
+        setsockopt(fd, SOL_SOCKET, SO_TIMESTAMPNS, &on, sizeof on) < 0 || !socket_bound_queue(fd)) {
         int error = errno;
         close(fd);
         return error;

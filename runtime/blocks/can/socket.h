@@ -8,6 +8,8 @@
 #ifndef FLOTILLA_CAN_SOCKET_H
 #define FLOTILLA_CAN_SOCKET_H
 
+#include "core/socket_queue.h"
+
 #include <flotilla/driver.h>
 #include <linux/can.h>
 #include <stdatomic.h>

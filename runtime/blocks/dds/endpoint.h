@@ -1,9 +1,9 @@
 /* Writers and readers of DDS topics: qualities of service, and the participant, of which a program has one for each
  * domain.
  *
- * DDS allocates and may take milliseconds, so no step calls it: samples pass through rings to and from a thread of the
- * block or of DDS (sender.h, receiver.h). $CYCLONEDDS_URI sets addresses, peers, interfaces and priorities for all
- * tasks of a robot.
+ * DDS allocates and may take milliseconds, so no step calls it: samples pass through triple buffers to and from a
+ * thread of the block or of DDS (sender.h, receiver.h). $CYCLONEDDS_URI sets addresses, peers, interfaces and
+ * priorities for all tasks of a robot.
  */
 #ifndef FLOTILLA_DDS_ENDPOINT_H
 #define FLOTILLA_DDS_ENDPOINT_H

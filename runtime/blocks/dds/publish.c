@@ -1,7 +1,7 @@
 /** dds-publish
  *
- * Publishes its input as a sample of a DDS topic, in each step or whenever `sequence` changes. The step puts the
- * sample into a ring; a thread gives it to DDS, which may allocate and block.
+ * Publishes its input as a sample of a DDS topic, in each step or whenever `sequence` changes. The step
+ * hands the sample to a thread, which gives it to DDS, which may allocate and block.
  *
  * Failure: No step waits for DDS. A sample that is older than `lifespan` when its turn comes is dropped, as is all but
  * the newest of those that wait. `written` counts what DDS took. While DDS cannot be had the thread tries again every

@@ -7,7 +7,13 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
-enum { WAITING = 16, BATCH = 8 };
+enum { BATCH = 8 };
+
+/* What DDS's thread hands over. */
+struct arrival {
+    uint32_t sequence;
+    _Alignas(8) unsigned char sample[]; /* begins with when it arrived */
+};
 
 static void matched(dds_entity_t reader, const dds_subscription_matched_status_t status, void *context)
 {
@@ -23,15 +29,17 @@ static void arrived(dds_entity_t reader, void *context)
     void *samples[BATCH] = {NULL};
     dds_sample_info_t infos[BATCH];
     dds_return_t count;
-    int64_t now_ns = fl_now_ns();
     while ((count = dds_take(reader, samples, infos, BATCH, BATCH)) > 0) {
+        int64_t now_ns = fl_now_ns();
         for (dds_return_t i = 0; i < count; i++) {
-            *(int64_t *)receiver->arriving = now_ns;
+            struct arrival *arrival = newest_back(&receiver->samples);
+            *(int64_t *)(void *)arrival->sample = now_ns;
             receiver->reader = reader;
             receiver->writer = infos[i].publication_handle;
-            if (!infos[i].valid_data || !receiver->decode(receiver->block, samples[i], receiver->arriving))
+            if (!infos[i].valid_data || !receiver->decode(receiver->block, samples[i], arrival->sample))
                 continue;
-            fl_ring_put(&receiver->samples, receiver->arriving);
+            arrival->sequence = ++receiver->arrived;
+            newest_put(&receiver->samples);
             eventfd_write(receiver->arrived_fd, 1);
         }
         dds_return_loan(reader, samples, count);
@@ -62,14 +70,10 @@ static void run(struct fl_driver *driver, void *context)
 
 int dds_receiver_start(struct dds_receiver *receiver, struct fl_block *block)
 {
-    void *ring = fl_allocate(block, fl_ring_bytes(receiver->sample_bytes, WAITING));
     receiver->block = block;
-    receiver->arriving = fl_allocate(block, receiver->sample_bytes);
-    receiver->taken = fl_allocate(block, receiver->sample_bytes);
-    if (!ring || !receiver->arriving || !receiver->taken)
+    if (newest_allocate(&receiver->samples, block, sizeof(struct arrival) + receiver->sample_bytes) != FL_OK)
         return FL_FAILED;
     fl_sensor_begin(&receiver->sensor);
-    fl_ring_initialize(&receiver->samples, ring, receiver->sample_bytes, WAITING);
     receiver->arrived_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     if (receiver->arrived_fd < 0)
         return fl_fail(block, "eventfd: %s", strerror(errno));
@@ -81,14 +85,13 @@ int dds_receiver_start(struct dds_receiver *receiver, struct fl_block *block)
 /* Take the newest sample that waits. When it arrived; 0: none did. */
 static int64_t take(struct dds_receiver *receiver)
 {
-    int64_t taken_ns = 0;
-    for (int i = 0; i < WAITING && fl_ring_take(&receiver->samples, receiver->taken); i++) {
-        taken_ns = *(const int64_t *)receiver->taken;
-        fl_sensor_update(&receiver->sensor, taken_ns, receiver->sensor.sequence + 1);
-    }
-    if (taken_ns)
-        receiver->give(receiver->block, receiver->taken);
-    return taken_ns;
+    const struct arrival *arrival = newest_take(&receiver->samples);
+    if (!arrival)
+        return 0;
+    int64_t arrived_ns = *(const int64_t *)(const void *)arrival->sample;
+    fl_sensor_update(&receiver->sensor, arrived_ns, arrival->sequence);
+    receiver->give(receiver->block, arrival->sample);
+    return arrived_ns;
 }
 
 /* Take the sample here instead of in the step: the step could find a newer one than the sample that triggered it. */
@@ -98,7 +101,7 @@ int64_t dds_receiver_await(struct dds_receiver *receiver, int64_t until_ns)
     receiver->awaited = true;
     do {
         eventfd_t count;
-        eventfd_read(receiver->arrived_fd, &count); /* before the look into the ring: later ones are not missed */
+        eventfd_read(receiver->arrived_fd, &count); /* before the look at the sample: later ones are not missed */
         taken_ns = take(receiver);
     } while (!taken_ns && fl_await_readable(receiver->arrived_fd, until_ns));
     return taken_ns ? taken_ns : take(receiver); /* a sample may have come while this thread woke up */

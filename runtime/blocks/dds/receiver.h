@@ -1,7 +1,8 @@
-/* What blocks that subscribe share: DDS's thread puts samples into a ring, from which the step takes the newest one. */
+/* What blocks that subscribe share: DDS's thread hands the newest sample to the step. */
 #ifndef FLOTILLA_DDS_RECEIVER_H
 #define FLOTILLA_DDS_RECEIVER_H
 
+#include "core/newest.h"
 #include "endpoint.h"
 
 #include <flotilla/sensor.h>
@@ -19,11 +20,11 @@ struct dds_receiver {
     /* The receiver's own. */
     struct fl_block *block;
     struct fl_driver *driver;
-    struct fl_ring samples;
-    void *arriving, *taken; /* samples: DDS's thread's, the step's */
-    dds_entity_t reader;    /* both of the sample that is decoded */
+    struct newest samples;
+    uint32_t arrived;    /* samples so far; DDS's thread's */
+    dds_entity_t reader; /* both of the sample that is decoded */
     dds_instance_handle_t writer;
-    int arrived_fd;     /* readable after something was put into the ring */
+    int arrived_fd;     /* readable after a sample was handed over */
     bool open, awaited; /* awaited: await takes samples instead of the step */
     _Atomic uint32_t peers;
     struct fl_sensor sensor;

@@ -7,8 +7,6 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
-enum { WAITING = 4 };
-
 const struct fl_port dds_sender_inputs[] = {
     {.name = "withhold", .type = FL_BOOLEAN, .width = 1, .flags = FL_OPTIONAL, .summary = "1: nothing is published"},
     {.name = "sequence",
@@ -35,14 +33,12 @@ static void matched(dds_entity_t writer, const dds_publication_matched_status_t 
 static void write_newest(struct dds_sender *sender, dds_entity_t writer)
 {
     char tokens[64];
-    bool any = false;
     while (recv(sender->wake[1], tokens, sizeof tokens, MSG_DONTWAIT) > 0)
         ;
-    while (fl_ring_take(&sender->samples, sender->taken))
-        any = true;
-    if (!any || fl_now_ns() - *(const int64_t *)sender->taken > llround(sender->topic.lifespan * 1e9))
+    const void *sample = newest_take(&sender->samples);
+    if (!sample || fl_now_ns() - *(const int64_t *)sample > llround(sender->topic.lifespan * 1e9))
         return;
-    sender->encode(sender->block, sender->taken, sender->storage);
+    sender->encode(sender->block, sample, sender->storage);
     if (dds_write(writer, sender->storage) == DDS_RETCODE_OK)
         atomic_fetch_add(&sender->written, 1);
 }
@@ -58,7 +54,7 @@ static void set_listener(dds_listener_t *listener)
 static void keep_instance(struct dds_sender *sender, dds_entity_t writer)
 {
     dds_instance_handle_t handle;
-    sender->encode(sender->block, sender->taken, sender->storage);
+    sender->encode(sender->block, sender->first, sender->storage);
     dds_return_t registered = dds_register_instance(writer, &handle, sender->storage);
     if (registered != DDS_RETCODE_OK)
         fl_log(sender->block, "topic %s: instance: %s", sender->topic.name, dds_strretcode(registered));
@@ -81,15 +77,12 @@ static void run(struct fl_driver *driver, void *context)
 
 int dds_sender_start(struct dds_sender *sender, struct fl_block *block, const void *first)
 {
-    void *ring = fl_allocate(block, fl_ring_bytes(sender->sample_bytes, WAITING));
     sender->block = block;
-    sender->made = fl_allocate(block, sender->sample_bytes);
-    sender->taken = fl_allocate(block, sender->sample_bytes);
+    sender->first = fl_allocate(block, sender->sample_bytes);
     sender->storage = fl_allocate(block, sender->storage_bytes);
-    if (!ring || !sender->made || !sender->taken || !sender->storage)
+    if (!sender->first || !sender->storage || newest_allocate(&sender->samples, block, sender->sample_bytes) != FL_OK)
         return FL_FAILED;
-    memcpy(sender->taken, first, sender->sample_bytes);
-    fl_ring_initialize(&sender->samples, ring, sender->sample_bytes, WAITING);
+    memcpy(sender->first, first, sender->sample_bytes);
     if (socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, sender->wake) < 0)
         return fl_fail(block, "socketpair: %s", strerror(errno));
     sender->driver = fl_driver_start(block, run, sender);
@@ -102,14 +95,17 @@ void *dds_sender_begin(struct dds_sender *sender)
     sender->sequence = FL_IN(sender->block, DDS_SEQUENCE, uint32_t);
     if (FL_IN(sender->block, DDS_WITHHOLD, uint8_t) || (before && before == sender->sequence))
         return NULL;
-    *(int64_t *)sender->made = fl_now_ns();
-    return sender->made;
+    void *made = newest_back(&sender->samples);
+    *(int64_t *)made = fl_now_ns();
+    return made;
 }
 
 void dds_sender_end(struct dds_sender *sender, const void *made)
 {
-    if (made && fl_ring_put(&sender->samples, made))
+    if (made) {
+        newest_put(&sender->samples);
         send(sender->wake[0], "", 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+    }
     FL_OUT(sender->block, DDS_PEERS, uint32_t) = atomic_load(&sender->peers);
     FL_OUT(sender->block, DDS_WRITTEN, uint32_t) = atomic_load(&sender->written);
 }

@@ -1,10 +1,9 @@
-/* What blocks that publish share: the step puts a sample into a ring, a thread gives the newest one to DDS. */
+/* What blocks that publish share: the step hands a sample to a thread, which gives the newest one to DDS. */
 #ifndef FLOTILLA_DDS_SENDER_H
 #define FLOTILLA_DDS_SENDER_H
 
+#include "core/newest.h"
 #include "endpoint.h"
-
-#include <stdatomic.h>
 
 struct dds_sender {
     /* Set by the block before it starts the sender. */
@@ -17,8 +16,8 @@ struct dds_sender {
     /* The sender's own. */
     struct fl_block *block;
     struct fl_driver *driver;
-    struct fl_ring samples;
-    void *made, *taken; /* samples: the step's, the thread's */
+    struct newest samples;
+    void *first; /* the sample of dds_sender_start */
     void *storage;
     int wake[2];       /* a byte for each sample: the step's end, and the thread's */
     uint32_t sequence; /* sequence in the step before; 0: nothing has come yet, or the input has no wire */

@@ -1,12 +1,13 @@
 /** udp-receive
  *
- * Receives datagrams of one length, at most 64 in a step, and looks at those that are refused for about a quarter of a
- * period. They are stamped by the kernel when they arrive. The block can trigger a task.
+ * Receives datagrams of one length. A step takes all that wait, at most 512, and looks at those that are refused for
+ * about a quarter of a period. They are stamped by the kernel when they arrive. The block can trigger a task.
  *
  * Failure: The flag is 0 once no datagram was taken for `timeout`. While the flag is 0 the values stay the last good
  * ones, and `age` grows. Datagrams of another length or sender are counted in `refused`, those lost to a full queue in
- * `dropped`. With several senders, one is listened to once those before it have been silent for longer than
- * `failover`. The interface and the local address may come later, go, and come back.
+ * `dropped`: between two steps about 100 long datagrams or 300 short ones find room, and `age` is that of the last.
+ * With several senders, one is listened to once those before it have been silent for longer than `failover`. The
+ * interface and the local address may come later, go, and come back.
  *
  * With `keys` each message carries 40 bytes more, which prove that it is the sender's and new. A message without that
  * is not taken; it is counted in `forged`, or in `replayed` if it came before. The first message after a start of
@@ -127,7 +128,7 @@ static void terminate(struct fl_block *block)
 FL_BLOCK(udp_receive) = {
     .abi = FL_ABI,
     .name = "udp-receive",
-    .summary = "receives datagrams of `length` bytes, at most 64 in a step: an output `data`, uint8",
+    .summary = "receives datagrams of `length` bytes, the newest or each in its turn: an output `data`, uint8",
     .source = "RFC 768; Linux: udp(7), socket(7)",
     FL_TABLE(output, outputs),
     FL_TABLE(parameter, parameters),

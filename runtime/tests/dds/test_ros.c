@@ -29,7 +29,7 @@ static bool passes(struct fl_block *from, struct fl_block *to)
     for (int waited = 0; waited < PATIENCE_MS; waited += PERIOD_MS) {
         step(from);
         step(to);
-        if (GET(to, "sequence", uint32_t) >= before + 3) /* more than the ring of the sender holds is made since */
+        if (GET(to, "sequence", uint32_t) >= before + 3) /* what waited at the sender is past */
             return true;
         poll(NULL, 0, PERIOD_MS);
     }
@@ -72,7 +72,7 @@ static void passes_a_scan(void **state)
     SET(from, "age", double, NAN);
     assert_true(passes(from, to));
     assert_near((double)(real.tv_sec - GET(to, "stamp", int64_t) / 1000000000), 0, 30);
-    steps_under_seccomp(from, 20); /* more than its ring holds */
+    steps_under_seccomp(from, 20);
     steps_under_seccomp(to, 5);
     testbed_end(from);
     testbed_end(to);
