@@ -228,33 +228,43 @@ static int64_t wait_for_release(struct executive *executive, int64_t *expected_n
     return *expected_ns;
 }
 
+/* How late steps end. */
+struct lateness {
+    int64_t in_a_row; /* overruns, without those of steps that catch up */
+    int64_t late_ns;  /* of the last step, after the next was due; what was skipped since is taken off */
+};
+
 /* When the next step is expected, after one that was expected at `expected_ns`, due at `release_ns`, and ended at
- * `now_ns`. */
+ * `now_ns`. A step that ends late, but less so than the one before it, catches up: of a stall it is no further overrun
+ * in a row. */
 static int64_t next_release(struct executive *executive, int64_t expected_ns, int64_t release_ns, int64_t now_ns,
-                            int64_t *in_a_row)
+                            struct lateness *lateness)
 {
     const struct task *task = executive->task;
     struct run_result *result = executive->result;
     int64_t next_ns = release_ns + task->period_ns;
     expected_ns += task->period_ns;
     if (executive->options->no_wait || now_ns <= next_ns) {
-        *in_a_row = 0;
+        *lateness = (struct lateness){0};
         return expected_ns;
     }
     char text[128];
+    int64_t late_ns = now_ns - next_ns;
     result->overruns++;
-    result->last_overrun = (struct overrun_of_step){result->steps - 1, now_ns, now_ns - next_ns};
-    ++*in_a_row;
-    if (task->overrun == OVERRUN_STOP_SAFE || (task->overruns && *in_a_row >= task->overruns)) {
+    result->last_overrun = (struct overrun_of_step){result->steps - 1, now_ns, late_ns};
+    lateness->in_a_row += late_ns > lateness->late_ns;
+    lateness->late_ns = late_ns;
+    if (task->overrun == OVERRUN_STOP_SAFE || (task->overruns && lateness->in_a_row >= task->overruns)) {
         snprintf(text, sizeof text,
                  "step %" PRIu64 " ended %" PRId64 " us after the next was due, %" PRId64 " in a row",
-                 result->last_overrun.step, result->last_overrun.late_ns / 1000, *in_a_row);
+                 result->last_overrun.step, late_ns / 1000, lateness->in_a_row);
         end(result, ENDING_OVERRUN, NULL, text);
     }
-    int64_t behind = (now_ns - next_ns) / task->period_ns + 1;
+    int64_t behind = late_ns / task->period_ns + 1;
     if (task->overrun == OVERRUN_CATCH_UP && behind <= CATCH_UP_PERIODS)
         return expected_ns;
     result->skipped += (uint64_t)behind;
+    lateness->late_ns -= behind * task->period_ns;
     return expected_ns + behind * task->period_ns;
 }
 
@@ -263,7 +273,8 @@ static void *control(void *argument)
     struct executive *executive = argument;
     const struct run_options *options = executive->options;
     struct run_result *result = executive->result;
-    int64_t in_a_row = 0, period_ns = executive->task->period_ns;
+    int64_t period_ns = executive->task->period_ns;
+    struct lateness lateness = {0};
     safety_step_begin();
     privilege_touch_stack();
     gather_rates(executive);
@@ -296,7 +307,7 @@ static void *control(void *argument)
             change_take(executive->change, result->steps);
         if (result->steps == options->steps)
             end(result, ENDING_ASKED, NULL, "all steps are done");
-        expected_ns = next_release(executive, expected_ns, release_ns, now_ns, &in_a_row);
+        expected_ns = next_release(executive, expected_ns, release_ns, now_ns, &lateness);
         status_put(executive->status, result, now_ns);
         if (result->ending != ENDING_NONE)
             break;

@@ -92,6 +92,14 @@ def test_overruns_are_left_out_or_caught_up_with(tasks: Tasks) -> None:
     assert catching_up["skipped"] == 0
 
 
+def test_one_stall_is_one_overrun_in_a_row_for_a_task_that_catches_up(tasks: Tasks) -> None:
+    """Seen to fail: "step 12 ended … after the next was due, 10 in a row", as each step that made up for it counted."""
+    stall = "bad: {type: misbehave, parameters: {manner: late, from: 3, until: 4, late_s: 1.05}}"
+    ended = tasks.run(task(stall, "period: 100 ms\noverrun: catch-up"), "--steps", "20")
+    assert (ended.status, ended.statistics["steps"]) == (0, 20), ended.err
+    assert ended.statistics["overruns"] >= 1
+
+
 def test_what_integrates_goes_by_time_where_steps_are_left_out(tasks: Tasks) -> None:
     """However slow the host: what lies between two steps of a block counts, up to ten of its periods."""
     blocks = """one: {type: constant, parameters: {value: 1}}
