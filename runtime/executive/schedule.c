@@ -6,6 +6,7 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 enum { AHEAD = 4 }; /* blocks: a line comes from memory in the time that those take */
 
@@ -26,6 +27,8 @@ struct schedule {
     struct call *calls;
     struct turn *turns;
     size_t count, turn_count;
+    const struct latch *latches; /* the task's */
+    size_t latch_count;
     bool counter;
     struct moment begin;
 };
@@ -44,6 +47,8 @@ struct schedule *schedule_create(const struct task *task)
     schedule->calls = made(sizeof *schedule->calls * (task->count + AHEAD));
     schedule->turns = made(sizeof *schedule->turns * (task->count + 1));
     schedule->count = task->count;
+    schedule->latches = task->latches;
+    schedule->latch_count = task->latch_count;
     for (size_t i = 0; i < task->count; i++) {
         const struct task_block *task_block = &task->blocks[i];
         schedule->calls[i] = (struct call){.step = task_block->block->type->step, .block = task_block->block};
@@ -71,6 +76,8 @@ const struct fl_block *schedule_step(struct schedule *schedule, int64_t release_
 {
     const bool counter = schedule->counter;
     struct call *call = schedule->calls;
+    for (size_t i = 0; i < schedule->latch_count; i++)
+        memcpy(schedule->latches[i].kept, schedule->latches[i].signal, schedule->latches[i].bytes);
     int64_t before = ticks_now(counter);
     for (struct turn *turn = schedule->turns, *last = turn + schedule->turn_count; turn < last; turn++) {
         struct call *end = call + turn->count;

@@ -14,6 +14,8 @@
 /* An input's place in the graph, while it is built. */
 struct edge {
     size_t from, to; /* `from` runs first */
+    bool delayed;    /* of a delayed input `port` of `from`; where `to` has to run first, the input is latched */
+    uint32_t port;
 };
 
 struct building {
@@ -295,7 +297,7 @@ static void wire_input(struct building *building, size_t index, uint32_t port, c
         return; /* a block that reads its own output of the step before needs no order */
     building->edges = grown(building->edges, sizeof *building->edges * (building->edge_count + 1));
     building->edges[building->edge_count++] =
-        to->flags & FL_DELAYED ? (struct edge){index, source} : (struct edge){source, index};
+        to->flags & FL_DELAYED ? (struct edge){index, source, true, port} : (struct edge){source, index, false, port};
 }
 
 static void wire_block(struct building *building, size_t index, const struct block_entry *entry)
@@ -352,7 +354,7 @@ static void report_cycle(struct building *building, const bool *done)
             memcpy(loop, longer, sizeof loop);
         }
         for (size_t e = 0; e < building->edge_count; e++) {
-            if (building->edges[e].to == at && !done[building->edges[e].from]) {
+            if (building->edges[e].to == at && !building->edges[e].delayed && !done[building->edges[e].from]) {
                 at = building->edges[e].from;
                 break;
             }
@@ -364,7 +366,45 @@ static void report_cycle(struct building *building, const bool *done)
     free(seen);
 }
 
-/* Order the blocks: sources first, otherwise as in the file. */
+/* The first block that is left and has nothing left to wait for, or nothing but readers of delayed inputs with
+ * `latching`; their number: there is none. */
+static size_t next_block(const struct building *building, const bool *done, bool latching)
+{
+    size_t next = 0;
+    for (; next < building->task->count; next++) {
+        bool ready = !done[next];
+        for (size_t e = 0; e < building->edge_count && ready; e++) {
+            const struct edge *edge = &building->edges[e];
+            ready = edge->to != next || done[edge->from] || (latching && edge->delayed);
+        }
+        if (ready)
+            break;
+    }
+    return next;
+}
+
+/* Let the delayed inputs that wait for this block read copies, so that it may run before their blocks. */
+static void latch(struct building *building, const bool *done, size_t source)
+{
+    struct task *task = building->task;
+    for (size_t e = 0; e < building->edge_count; e++) {
+        const struct edge *edge = &building->edges[e];
+        if (edge->to != source || !edge->delayed || done[edge->from])
+            continue;
+        struct fl_block *block = task->blocks[edge->from].block;
+        const struct fl_port *port = &block->in_ports[edge->port];
+        struct latch made = {.signal = block->in[edge->port], .bytes = fl_type_size(port->type) * port->width};
+        made.kept = fl_allocate(block, made.bytes);
+        if (!made.kept)
+            abort();
+        block_wire(block, edge->port, made.kept);
+        task->latches = grown(task->latches, sizeof made * (task->latch_count + 1));
+        task->latches[task->latch_count++] = made;
+    }
+}
+
+/* Order the blocks: sources first, readers of delayed inputs before their sources where that is possible, otherwise as
+ * in the file. */
 static void order(struct building *building)
 {
     struct task *task = building->task;
@@ -372,14 +412,9 @@ static void order(struct building *building)
     bool *done = grown(NULL, task->count + 1);
     memset(done, 0, task->count + 1);
     for (size_t placed = 0; placed < task->count; placed++) {
-        size_t next = 0;
-        for (; next < task->count; next++) {
-            bool ready = !done[next];
-            for (size_t e = 0; e < building->edge_count && ready; e++)
-                ready = building->edges[e].to != next || done[building->edges[e].from];
-            if (ready)
-                break;
-        }
+        size_t next = next_block(building, done, false);
+        if (next == task->count && (next = next_block(building, done, true)) < task->count)
+            latch(building, done, next);
         if (next == task->count) {
             report_cycle(building, done);
             free(ordered);
@@ -464,6 +499,7 @@ void task_free(struct task *task)
     for (size_t i = 0; i < task->count; i++)
         block_destroy(task->blocks[i].block);
     free(task->blocks);
+    free(task->latches);
     free(task->name);
     *task = (struct task){0};
 }
@@ -494,10 +530,14 @@ int64_t task_actuator_timeout(const struct task *task)
 
 static void write_edge(const struct task *task, const struct fl_block *to, uint32_t input, FILE *out)
 {
+    const char *at = to->in[input];
+    for (size_t i = 0; i < task->latch_count; i++)
+        if (at == task->latches[i].kept)
+            at = task->latches[i].signal;
     for (size_t i = 0; i < task->count; i++) {
         const struct fl_block *from = task->blocks[i].block;
         for (uint32_t port = 0; port < from->out_count; port++) {
-            const char *start = from->out[port], *at = to->in[input];
+            const char *start = from->out[port];
             size_t size = fl_type_size(from->out_ports[port].type);
             if (at < start || at >= start + size * from->out_ports[port].width)
                 continue;

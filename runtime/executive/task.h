@@ -19,6 +19,14 @@ struct task_block {
     bool incomplete;      /* its ports are not known, because its parameters are wrong */
 };
 
+/* What a block with a delayed input reads, where it runs after the source of that input: the source's value of the step
+ * before, copied when a step begins. */
+struct latch {
+    void *kept;
+    const void *signal;
+    size_t bytes;
+};
+
 struct task {
     char *name; /* the file's, without directory and suffix */
     int64_t period_ns, phase_ns, overruns;
@@ -29,6 +37,8 @@ struct task {
     struct fl_block *trigger;  /* a step is due when this block has new input */
     struct task_block *blocks; /* in the order of execution */
     size_t count;
+    struct latch *latches;
+    size_t latch_count;
 };
 
 /* Build the task of `problems->file`. All problems go to `problems`; without any the task is usable. Opens no device.

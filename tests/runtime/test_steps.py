@@ -33,6 +33,32 @@ before: {type: delay, in: {in: ramp.out}}
     assert {after - before for before, after in itertools.pairwise(releases)} == {1_000_000}
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("every", [1, 3])
+def test_an_integrator_takes_input_and_reset_from_one_source(tasks: Tasks, every: int, sign: int) -> None:
+    """It is reset at the end of the ramp, or at its begin. Seen to fail: "cycle without delay: sum → ramp → signed →
+    high → sum", though `in` of the step before closes no loop."""
+    text = task(
+        f"""
+sum: {{type: integrator, every: {every}, in: {{in: ramp.out, reset: high.out}}, parameters: {{initial: 5}}}}
+ramp: {{type: sum, in: {{in0: before.out, in1: 1}}, parameters: {{signs: "++"}}}}
+before: {{type: delay, in: {{in: ramp.out}}}}
+signed: {{type: gain, in: {{in: ramp.out}}, parameters: {{factor: {sign}}}}}
+high: {{type: schmitt-trigger, in: {{in: signed.out}}, parameters: {{on: {sign * 6.5}, off: {sign * 6.5}}}}}
+"""
+    )
+    ended = tasks.run(text, "--steps", "20", "--no-wait", "--watch", "ramp.out,high.on,sum.out")
+    assert ended.status == 0, ended.err
+    assert [row["ramp.out"] for row in ended.rows] == list(range(1, 21))
+    expected = [5.0]
+    for row in ended.rows[every::every]:
+        before = row["ramp.out"] - 1  # the source's value of the task's step before
+        expected.append(5.0 if row["high.on"] else expected[-1] + 0.001 * every * before)
+    assert [row["sum.out"] for row in ended.rows[::every]] == pytest.approx(expected, abs=1e-12)
+    dot = subprocess.run(tasks.argv(text, "--dot"), capture_output=True, text=True, timeout=60, check=True).stdout
+    assert '"ramp" -> "sum" [label="out → in", style=dashed]' in dot
+
+
 def test_steps_are_due_at_the_phase(tasks: Tasks) -> None:
     text = task("a: {type: gain, in: {in: 1}}", "period: 4 ms\nphase: 1500 us")
     ended = tasks.run(text, "--steps", "3", "--watch", "a.out")

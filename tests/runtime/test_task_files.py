@@ -103,6 +103,14 @@ REFUSED = {
         task("a: {type: gain, in: {in: b.out}}\nb: {type: gain, in: {in: a.out}}"),
         "3: cycle without delay: a → b → a; put a block delay into one of its wires",
     ),
+    "cycle beside a delayed input": (
+        task(
+            "g: {type: gain, in: {in: i.out}}\n"
+            "s: {type: schmitt-trigger, in: {in: i.out}, parameters: {on: 1, off: 0}}\n"
+            "i: {type: integrator, in: {in: g.out, reset: s.on}}"
+        ),
+        "5: cycle without delay: i → s → i; put a block delay into one of its wires",
+    ),
     "a frame twice": (
         task("a: {type: can-send, in: {data: 1, age: 0}, parameters: {id: 9, length: 1}}\n" * 2).replace("a:", "b:", 1),
         '4: block a: interface "can0", id 9, extended false is block b\'s; only one block may use a device',

@@ -1,7 +1,7 @@
 /** delay
  *
- * Outputs the value that its input had a step before, for a signal of any type. The task runs the reader of a delayed
- * input before the block that writes it, so this block may close a loop of wires.
+ * Outputs the value that its input had a step before, for a signal of any type, so this block may close a loop of
+ * wires.
  *
  * Equations:
  *   out(k) = in(k − 1),  out(0) = initial

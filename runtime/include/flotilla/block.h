@@ -53,8 +53,7 @@ int fl_type_named(const char *name);         /* the type of that name, or -1 */
 
 enum {
     FL_OPTIONAL = 1u << 0, /* input: needs no wire, and reads zero without one */
-    /* input: reads the source's value of the previous step, because the block runs before its source; so it may close a
-       loop of wires */
+    /* input: reads the source's value of the previous step, so it may close a loop of wires */
     FL_DELAYED = 1u << 1,
     /* output, uint32 of width 1: counts what others sent and the block refused; the task's status names it */
     FL_REFUSALS = 1u << 2,
