@@ -182,7 +182,7 @@ static void list_writes(struct epos2 *drive)
     if (set->homing_method)
         list_homing(drive);
     write_object(drive, 0x6007, 0, 2, 1); /* a lost connection is a fault: it stops, and stays so until reset */
-    write_object(drive, 0x1017, 0, 2, (uint32_t)set->heartbeat_ms / 2);
+    write_object(drive, 0x1017, 0, 2, (uint32_t)set->heartbeat_ms / EPOS2_HEARTBEATS);
     /* From now on it waits for our heartbeats. */
     write_object(drive, 0x1016, 1, 4, (uint32_t)set->master << 16 | set->heartbeat_ms);
 }
@@ -641,11 +641,13 @@ size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_com
     }
     if (drive->phase == EPOS2_REFUSED && now_ns - drive->phase_ns >= refused_retry_ns)
         enter(drive, EPOS2_BOOTING, now_ns - boot_retry_ns);
-    if (now_ns - drive->heartbeat_ns >= silence_ns / 3) { /* one may be lost */
+    /* The next call would be too late. */
+    if (now_ns + (now_ns - drive->advanced_ns) - drive->heartbeat_ns > silence_ns / EPOS2_HEARTBEATS) {
         drive->heartbeat_ns = now_ns;
         out[count] = frame_of(COB_HEARTBEAT + drive->settings.master, 1);
         out[count++].data[0] = STATE_OPERATIONAL;
     }
+    drive->advanced_ns = now_ns;
     bool armed = is_armed(drive, command->enable);
     if (drive->phase == EPOS2_BOOTING)
         count += boot(drive, now_ns, &out[count]);

@@ -85,6 +85,9 @@ struct epos2_trouble {
 enum {
     EPOS2_WRITES = 64, /* SDOs of a configuration, at most */
     EPOS2_FRAMES = 4,  /* frames of one call, at most */
+    /* Heartbeats of either side in the longest silence that the other tolerates: two in a row may be lost, and the
+     * third late. */
+    EPOS2_HEARTBEATS = 4,
 };
 
 struct epos2_write {
@@ -101,6 +104,7 @@ struct epos2 {
     bool sdo_waiting, reset_sent;
     int64_t phase_ns, sdo_ns;          /* begin of the phase, of the SDO that waits */
     int64_t received_ns, heartbeat_ns; /* its last heartbeat, ours */
+    int64_t advanced_ns;               /* the last epos2_advance */
     int64_t stop_ns, reset_ns;         /* begin of a quick stop, the last fault reset */
     bool stopping, reset_wanted, was_enabled;
     bool contacted; /* it has been in operation */

@@ -64,7 +64,9 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct epos2_block, gear, .default_value = "1", .min = 1e-6, .max = 1e6,
                  .summary = "turns of the motor for one of the gear's output, where target and outputs are measured"),
     FL_PARAMETER(struct epos2_block, heartbeat, .default_value = "0.1", .min = 0.006, .max = 60, .unit = "s",
-                 .summary = "time-out of the heartbeats between drive and block"),
+                 .summary =
+                     "longest silence between drive and block: each sends a heartbeat four times in it, of which "
+                     "two in a row may be lost"),
     FL_PARAMETER(struct epos2_block, max_velocity, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s",
                  .summary = "limit of velocity targets and profiles; 0 leaves what the drive has stored"),
     FL_PARAMETER(struct epos2_block, acceleration, .default_value = "0", .min = 0, .max = 1e6, .unit = "rad/s²",
@@ -171,9 +173,9 @@ static int configure(struct fl_block *block)
     const struct epos2_block *set = block->parameters;
     if (set->node == set->master)
         return fl_fail(block, "node and master are both %d: each node on a bus has its own address", (int)set->node);
-    if ((double)block->period_ns * 3e-9 > set->heartbeat)
-        return fl_fail(block, "heartbeat %g s is shorter than three periods: a drive that misses one step would stop",
-                       set->heartbeat);
+    if (llround(set->heartbeat * 1e9) < EPOS2_HEARTBEATS * block->period_ns)
+        return fl_fail(block, "heartbeat %g s is shorter than %d periods: a drive that misses two steps would stop",
+                       set->heartbeat, EPOS2_HEARTBEATS);
     return FL_OK;
 }
 

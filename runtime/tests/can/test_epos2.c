@@ -15,6 +15,7 @@ struct stub {
     struct epos2 engine;
     struct epos2_command command;
     int64_t now_ns;
+    int64_t lossy_ns, beat_ns; /* from one of the drive's heartbeats to the next that is not lost; 0: each arrives */
     bool present, operational, answers, moves_on; /* moves_on: its axis obeys the control word */
     struct can_frame sent[EPOS2_FRAMES];
     size_t sent_count;
@@ -149,7 +150,10 @@ static void period(struct stub *stub)
     assert_true(stub->sent_count <= EPOS2_FRAMES);
     if (!stub->present)
         return;
-    deliver(stub, 0x700 + NODE, 1, stub->operational ? "\x05" : "\x7F");
+    if (stub->now_ns - stub->beat_ns >= stub->lossy_ns) {
+        stub->beat_ns = stub->now_ns;
+        deliver(stub, 0x700 + NODE, 1, stub->operational ? "\x05" : "\x7F");
+    }
     for (size_t i = 0; i < stub->sent_count; i++)
         take(stub, &stub->sent[i]);
 }
@@ -306,8 +310,8 @@ static void finds_its_way_into_operation(void **state)
     period(stub);
     assert_int_equal(stub->sent[0].can_id, 0x605); /* 6040 = 0: no power while it is configured */
     assert_memory_equal(stub->sent[0].data, "\x2B\x40\x60\x00\x00\x00\x00\x00", 8);
-    period(stub);
-    assert_memory_equal(stub->sent[0].data, "\x2F\x60\x60\x00\xFE\x00\x00\x00", 8); /* 6060 = -2 */
+    period(stub);                                                                   /* our next heartbeat is due */
+    assert_memory_equal(stub->sent[1].data, "\x2F\x60\x60\x00\xFE\x00\x00\x00", 8); /* 6060 = -2 */
     periods(stub, CONTACT);
     assert_true(epos2_enabled(&stub->engine));
     const uint16_t way[] = {0x0006, 0x0007, 0x000F};
@@ -755,25 +759,38 @@ static void names_the_first_cause(void **state)
     test_free(stub);
 }
 
-static void sends_heartbeats(void **state)
+/* Of three heartbeats in a row two are lost, on either way, and no side takes the other for lost, though it does so
+ * after `heartbeat`. Seen to fail: none came for 60 ms of 40, and with those of the drive twice in `heartbeat` it was
+ * given up. */
+static void two_heartbeats_may_be_lost(void **state)
 {
     (void)state;
-    struct stub *stub = enabled(usual);
-    int64_t last_ns = stub->now_ns, longest_ns = 0;
-    int count = 0;
-    for (int i = 0; i < 100; i++) {
-        period(stub);
-        for (size_t f = 0; f < stub->sent_count; f++) {
-            if (stub->sent[f].can_id != 0x77F)
-                continue;
-            longest_ns = stub->now_ns - last_ns > longest_ns ? stub->now_ns - last_ns : longest_ns;
-            last_ns = stub->now_ns;
-            count++;
+    for (uint16_t heartbeat_ms = 4 * PERIOD_MS; heartbeat_ms <= 1000; heartbeat_ms += 7) {
+        struct epos2_settings settings = usual;
+        settings.heartbeat_ms = heartbeat_ms;
+        struct stub *stub = enabled(settings);
+        assert_int_equal(*object(stub, 0x101601), 127 << 16 | heartbeat_ms);
+        stub->lossy_ns = 3 * *object(stub, 0x101700) * MS;
+        int64_t last_ns = stub->now_ns, longest_ns = 0;
+        int count = 0, steps = 20 * heartbeat_ms / PERIOD_MS;
+        for (int i = 0; i < steps; i++) {
+            period(stub);
+            for (size_t f = 0; f < stub->sent_count; f++) {
+                if (stub->sent[f].can_id != 0x77F || count++ % 3)
+                    continue;
+                longest_ns = stub->now_ns - last_ns > longest_ns ? stub->now_ns - last_ns : longest_ns;
+                last_ns = stub->now_ns;
+            }
         }
+        assert_true(longest_ns > 0 && longest_ns + PERIOD_MS * MS <= heartbeat_ms * MS); /* and a step may be late */
+        assert_in_range(count, 20 * 4, 20 * 8);
+        assert_true(epos2_enabled(&stub->engine));
+        assert_int_equal(stub->engine.trouble.cause, EPOS2_FINE);
+        stub->present = false;
+        periods(stub, heartbeat_ms / PERIOD_MS + 2);
+        assert_int_equal(stub->engine.trouble.cause, EPOS2_NO_HEARTBEAT);
+        test_free(stub);
     }
-    assert_true(longest_ns <= 50 * MS); /* one may be lost in 100 ms */
-    assert_in_range(count, 24, 34);
-    test_free(stub);
 }
 
 /* A drive that has not received any would not miss them: the motor would run on for ever. */
@@ -944,7 +961,7 @@ int main(void)
         cmocka_unit_test(a_motor_that_stopped_restarts_where_that_is_wanted),
         cmocka_unit_test(enable_is_for_a_drive_that_is_there),
         cmocka_unit_test(names_the_first_cause),
-        cmocka_unit_test(sends_heartbeats),
+        cmocka_unit_test(two_heartbeats_may_be_lost),
         cmocka_unit_test(a_heartbeat_comes_before_any_motion),
         cmocka_unit_test(offers_positions_by_edges),
         cmocka_unit_test(disables_at_once),

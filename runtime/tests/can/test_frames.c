@@ -244,8 +244,8 @@ static void refuses(void **state)
     assert_non_null(strstr(testbed_refusal("can-receive", "id", "0x800", NULL), "more than 11 bits: set `extended`"));
     assert_non_null(strstr(testbed_refusal("epos2", "node", "127", "mode", "current", NULL), "both 127"));
     /* The testbed's period is 10 ms. */
-    assert_non_null(strstr(testbed_refusal("epos2", "node", "1", "mode", "current", "heartbeat", "0.029", NULL),
-                           "shorter than three periods"));
+    assert_non_null(strstr(testbed_refusal("epos2", "node", "1", "mode", "current", "heartbeat", "0.039", NULL),
+                           "shorter than 4 periods"));
     assert_non_null(strstr(testbed_refusal("can-send", "id", "0x800", NULL), "more than 11 bits: set `extended`"));
     assert_non_null(strstr(testbed_refusal("can-send", "id", "1", "reset", "00", NULL), "is not 8 bytes"));
     assert_non_null(
