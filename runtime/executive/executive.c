@@ -28,6 +28,8 @@ enum {
     WATCH_MS = 20,
     CATCH_UP_PERIODS = 10, /* further behind, the remaining steps are skipped */
     HOLDER_MS = 1000,      /* wait for another process to release a device, when only making outputs safe */
+    BURST_PERIODS = 2,     /* that a triggered task may be ahead of its mean rate */
+    CLOCKS_DIFFER = 1000,  /* the clocks of two computers differ by less than one part in so many */
     LATE_PERIODS = 5, /* from the end of a step to the end of the next: two for a late trigger, three for a late step */
     HUNG_PERIODS = 10, /* without a step, where no actuator time-out sets a limit */
 };
@@ -199,33 +201,51 @@ static int64_t await_unless_stopped(struct executive *executive, struct fl_block
     return came_ns || asked_to_stop(executive) ? came_ns : trigger->type->await(trigger, latest_ns);
 }
 
-/* Wait until a step is due. Returns when it was due. `expected_ns`: when it should be due; each trigger event moves it.
+/* When a step of a triggered task should be due, which each trigger event moves; and from when on it may be due, so
+ * that the task does not step faster than its period in the mean. */
+struct pace {
+    int64_t expected_ns, soonest_ns;
+};
+
+/* A step is due at `release_ns`: pay a period for it, less what the clocks of two computers differ by, so that a sender
+ * of the same rate is followed without delay. Periods without a step count for some time. */
+static int64_t pay(struct executive *executive, struct pace *pace, int64_t release_ns)
+{
+    const int64_t period_ns = executive->task->period_ns, least_ns = release_ns - BURST_PERIODS * period_ns;
+    pace->soonest_ns =
+        (pace->soonest_ns > least_ns ? pace->soonest_ns : least_ns) + period_ns - period_ns / CLOCKS_DIFFER;
+    return release_ns;
+}
+
+/* Wait until a step is due. Returns when it was due.
  *
  * The trigger may fire from half a period early to three quarters of a period late. On trigger time-out the task steps
  * without new input, so there are as many steps as periods, and blocks notice the silence. An event that comes sooner
  * waits, so a flood of messages does not become a flood of steps. An event later than that leads to two steps and two
  * messages, of which the next task may take only the newer. Waiting for a whole period could not distinguish a late
- * event from the next one.
+ * event from the next one. Events that come faster than the period wait until the mean of steps permits the next; the
+ * newest is taken then.
  */
-static int64_t wait_for_release(struct executive *executive, int64_t *expected_ns)
+static int64_t wait_for_release(struct executive *executive, struct pace *pace)
 {
     struct fl_block *trigger = executive->task->trigger;
     const int64_t early_ns = executive->task->period_ns / 2, late_ns = executive->task->period_ns * 3 / 4;
     if (executive->options->no_wait)
-        return *expected_ns;
+        return pace->expected_ns;
     if (!trigger) {
-        sleep_unless_stopped(executive, *expected_ns);
-        return *expected_ns;
+        sleep_unless_stopped(executive, pace->expected_ns);
+        return pace->expected_ns;
     }
-    const int64_t earliest_ns = *expected_ns - early_ns, latest_ns = *expected_ns + late_ns;
+    const int64_t early = pace->expected_ns - early_ns, latest_ns = pace->expected_ns + late_ns;
+    const int64_t earliest_ns = early > pace->soonest_ns ? early : pace->soonest_ns;
     sleep_unless_stopped(executive, earliest_ns);
     int64_t came_ns = await_unless_stopped(executive, trigger, latest_ns);
     if (!came_ns) {
         executive->result->timeouts += !asked_to_stop(executive);
-        return latest_ns;
+        return pay(executive, pace, latest_ns);
     }
-    *expected_ns = came_ns > earliest_ns ? came_ns : earliest_ns;
-    return *expected_ns;
+    pace->expected_ns = came_ns > earliest_ns ? came_ns : earliest_ns;
+    return pay(executive, pace, pace->expected_ns);
 }
 
 /* How late steps end. */
@@ -279,9 +299,9 @@ static void *control(void *argument)
     privilege_touch_stack();
     gather_rates(executive);
     /* Skip whole periods, so that the tasks of one computer keep their phases relative to each other. */
-    int64_t expected_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns;
+    struct pace pace = {.expected_ns = (fl_now_ns() / period_ns + 2) * period_ns + executive->task->phase_ns};
     while (!asked_to_stop(executive)) {
-        int64_t release_ns = wait_for_release(executive, &expected_ns);
+        int64_t release_ns = wait_for_release(executive, &pace);
         if (asked_to_stop(executive))
             break; /* this step is not due yet */
         int64_t begin_ns = fl_now_ns();
@@ -307,7 +327,7 @@ static void *control(void *argument)
             change_take(executive->change, result->steps);
         if (result->steps == options->steps)
             end(result, ENDING_ASKED, NULL, "all steps are done");
-        expected_ns = next_release(executive, expected_ns, release_ns, now_ns, &lateness);
+        pace.expected_ns = next_release(executive, pace.expected_ns, release_ns, now_ns, &lateness);
         status_put(executive->status, result, now_ns);
         if (result->ending != ENDING_NONE)
             break;
