@@ -4,7 +4,11 @@
  * sets it to `baud`, and switches its laser on.
  *
  * Equations:
- *   range in m = millimetres/1000; `invalid` where it is below `min_range` or beyond `max_range`
+ *   range in m = millimetres/1000; −∞ where something is too near to be measured; `invalid` where nothing was measured
+ *   nothing was measured: millimetres/1000 > max_range, or an error code, which is less than min_range and 20, or 6
+ *   where min_range is below 0.02 m
+ *   too near: less than min_range but no error code, or the code 18 of 20, or the codes 2 and 4 of 6
+ *   `invalid: zero` gives 0 for both
  *
  * Failure: The flag is 0 once no scan came for `timeout`, and while the port is closed. While the flag is 0 the values
  * stay the last good ones, and `age` grows. A scan with a wrong checksum or length is dropped. A scanner that falls
@@ -49,9 +53,10 @@ static const struct fl_parameter parameters[] = {
     FL_PARAMETER(struct urg, precision, .default_value = "double", .choices = "double|single",
                  .summary = "of `ranges`"),
     FL_PARAMETER(struct urg, invalid, .default_value = "nan", .choices = "nan|zero",
-                 .summary = "value in `ranges` of a direction without a measurement"),
+                 .summary = "value in `ranges` of a direction where nothing was measured"),
     FL_PARAMETER(struct urg, min_range, .default_value = "0.02", .min = 0, .max = 262, .unit = "m",
-                 .summary = "shorter values are error codes: 0.02 for a URG-04LX, 0.006 for a UTM-30LX"),
+                 .summary = "shorter values are error codes, or something too near: 0.02 for a URG-04LX, 0.006 for a "
+                            "UTM-30LX"),
     FL_PARAMETER(struct urg, max_range, .default_value = "5.6", .min = 0, .max = 262, .unit = "m",
                  .summary = "longer values are not measurements"),
     FL_SENSOR_TIMEOUT(struct urg, "0.3"),
@@ -361,6 +366,28 @@ static double invalid_range(const struct urg *urg)
     return urg->invalid == NOT_A_NUMBER ? NAN : 0;
 }
 
+/* The error codes of the scanner: the UTM-30LX's, or those of the URG-04LX, UBG-04LX and UHG-08LX. */
+static const struct codes {
+    double min_range; /* m, from which on these are meant */
+    uint32_t count;
+    uint32_t near; /* a bit for each code by which something is there that is too near, or reflects too much */
+} codes[] = {{0.02, 20, 1u << 18}, {0, 6, 1u << 2 | 1u << 4}};
+
+/* Something is there, and it is too near to be measured. */
+static bool too_near(const struct urg *urg, uint32_t millimetres)
+{
+    const struct codes *of = &codes[urg->min_range < codes[0].min_range];
+    return millimetres < of->count ? of->near >> millimetres & 1 : millimetres / 1000.0 < urg->min_range;
+}
+
+static double range_of(const struct urg *urg, uint32_t millimetres)
+{
+    double range = millimetres / 1000.0;
+    if (range >= urg->min_range && range <= urg->max_range)
+        return range;
+    return urg->invalid == NOT_A_NUMBER && too_near(urg, millimetres) ? (double)-INFINITY : invalid_range(urg);
+}
+
 static int initialize(struct fl_block *block)
 {
     for (uint32_t point = 0; point < block->out_ports[OUT_RANGES].width; point++)
@@ -372,11 +399,8 @@ static int initialize(struct fl_block *block)
 static void take_scan(struct fl_block *block, const struct urg_scan *scan)
 {
     const struct urg *urg = block->parameters;
-    for (uint32_t point = 0; point < scan->count; point++) {
-        double range = scan->millimetres[point] / 1000.0;
-        bool valid = range >= urg->min_range && range <= urg->max_range;
-        set_range(block, point, valid ? range : invalid_range(urg));
-    }
+    for (uint32_t point = 0; point < scan->count; point++)
+        set_range(block, point, range_of(urg, scan->millimetres[point]));
     FL_OUT(block, OUT_TIMESTAMP, double) = scan->timestamp / 1000.0;
 }
 
@@ -407,7 +431,7 @@ FL_BLOCK(urg) = {
     .summary =
         "Hokuyo laser scanner that speaks SCIP 2.0 (URG-04LX, UTM-30LX, ...); a scanner at another rate is found, "
         "and set to `baud`",
-    .source = "Hokuyo communication protocol specification for SCIP 2.0, C-42-03320B",
+    .source = "Hokuyo communication protocol specification for SCIP 2.0, C-42-03320B; REP 117: too near is −∞",
     FL_TABLE(parameter, parameters),
     .parameters_size = sizeof(struct urg),
     .state_size = sizeof(struct state),

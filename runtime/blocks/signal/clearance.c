@@ -9,10 +9,11 @@
  *   R = 1/|curvature|;  q = py on a curve to the left, −py on one to the right;  d = √(px² + (q − R)²)
  *   on a curve s = R·(atan2(px, R − q) − acos((R² + d² − radius²)/(2·R·d))), plus 2π·R where that is negative
  *   clearance = min(s of all points, reach);  a point within the disc: s = 0 where px > 0, otherwise it is left behind
+ *   a range of −∞ is something at the scanner, too near to be measured: s = 0 where x > 0 or cos(b) > 0
  *
- * Failure: A direction whose range is not finite counts as free, as beyond the scanner's reach. While fewer than
- * `least_seen` of all directions have a finite range, or the input `flag` is 0, the output `flag` is 0, and each
- * clearance is 0.
+ * Failure: A direction whose range is not a number, or is +∞, counts as free, as beyond the scanner's reach. While
+ * fewer than `least_seen` of all directions have another range, or the input `flag` is 0, the output `flag` is 0, and
+ * each clearance is 0.
  */
 #include <flotilla/block.h>
 #include <math.h>
@@ -104,10 +105,16 @@ static int step(struct fl_block *block)
     int64_t seen = 0;
     for (size_t i = 0; i < set->curvatures.count; i++)
         clearance[i] = set->reach;
+    bool blocked = false;
     for (int64_t i = 0; i < set->points; i++) {
-        if (!isfinite(ranges[i]))
-            continue;
         double bearing = set->first + (double)i * set->increment;
+        if (!(ranges[i] < (double)INFINITY))
+            continue;
+        if (!isfinite(ranges[i])) {
+            seen++;
+            blocked |= set->x > 0 || cos(bearing) > 0;
+            continue;
+        }
         double px = set->x + ranges[i] * cos(bearing), py = ranges[i] * sin(bearing);
         seen++;
         if (hypot(px, py) > set->reach + set->radius)
@@ -116,7 +123,7 @@ static int step(struct fl_block *block)
             clearance[j] = fmin(clearance[j], path(set, set->curvatures.value[j], px, py));
     }
     bool good = FL_IN(block, GOOD, uint8_t) && (double)seen >= set->least_seen * (double)set->points;
-    for (size_t i = 0; !good && i < set->curvatures.count; i++)
+    for (size_t i = 0; (!good || blocked) && i < set->curvatures.count; i++)
         clearance[i] = 0;
     FL_OUT(block, FLAG, bool) = good;
     return FL_OK;

@@ -76,6 +76,38 @@ static void stands_against_something(void **state)
     testbed_end(block);
 }
 
+/* As REP 117 has it, and the block urg: −∞ is too near, +∞ is nothing. Seen to fail: the clearance was 4 m. */
+static void stops_for_what_is_too_near(void **state)
+{
+    (void)state;
+    struct fl_block *block = scanner("0.5");
+    for (int direction = 0; direction < 4;
+         direction++) { /* the scanner is ahead of the axle, and so is all around it */
+        double ranges[] = {3, 3, 3, 3};
+        ranges[direction] = -INFINITY;
+        const double *found = clearances(block, ranges[0], ranges[1], ranges[2], ranges[3]);
+        for (int i = 0; i < 3; i++)
+            assert_near(found[i], 0, 0);
+        assert_true(GET(block, "flag", uint8_t));
+    }
+    assert_near(clearances(block, INFINITY, NAN, 3, 3)[1], 4, 0);
+    testbed_end(block);
+    block = testbed_block("curve-clearance", "points", "2", "first", "0", "increment", "3.141592653589793", "radius",
+                          "0.3", "reach", "4", NULL);
+    testbed_begin(block);
+    SET(block, "flag", uint8_t, 1);
+    double *ranges = testbed_input(block, "ranges");
+    ranges[0] = -INFINITY;
+    ranges[1] = 3;
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_near(GET(block, "clearance", double), 0, 0);
+    ranges[0] = 3;
+    ranges[1] = -INFINITY; /* behind */
+    assert_int_equal(testbed_step(block), FL_OK);
+    assert_near(GET(block, "clearance", double), 2.7, 1e-12);
+    testbed_end(block);
+}
+
 static void says_when_it_sees_nothing(void **state)
 {
     (void)state;
@@ -105,6 +137,7 @@ int main(void)
         cmocka_unit_test(goes_straight),
         cmocka_unit_test(goes_around),
         cmocka_unit_test(stands_against_something),
+        cmocka_unit_test(stops_for_what_is_too_near),
         cmocka_unit_test(says_when_it_sees_nothing),
         cmocka_unit_test(refuses),
     };
