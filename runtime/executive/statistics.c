@@ -34,7 +34,7 @@ int64_t statistics_percentile_ns(const struct statistics *statistics, double per
 {
     double below = 0, wanted = (double)statistics->count * percent / 100;
     for (unsigned bucket = 0; bucket < STATISTICS_BUCKETS; bucket++) {
-        below += statistics->histogram[bucket];
+        below += (double)statistics->histogram[bucket];
         if (below >= wanted && below > 0)
             return upper_ns(bucket) < statistics->max_ns ? upper_ns(bucket) : statistics->max_ns;
     }

@@ -10,7 +10,7 @@ enum { STATISTICS_BUCKETS = 80 };
 struct statistics {
     uint64_t count;
     int64_t min_ns, max_ns, sum_ns;
-    uint32_t histogram[STATISTICS_BUCKETS];
+    uint64_t histogram[STATISTICS_BUCKETS];
 };
 
 void statistics_add(struct statistics *statistics, int64_t ns);
