@@ -14,9 +14,9 @@
  * Gives the angles of a quaternion, as angles-to-quaternion has them. It need not have length 1.
  *
  * Equations:
- *   n = x² + y² + z² + w²
- *   roll = atan2(2·(w·x + y·z), w² − x² − y² + z²),  yaw = atan2(2·(w·z + x·y), w² + x² − y² − z²)
- *   pitch = asin(2·(w·y − z·x)/n)
+ *   a = w − y,  b = x + z,  c = w + y,  d = z − x;  s = atan2(b, a),  t = atan2(d, c)
+ *   pitch = 2·atan2(√(c² + d²), √(a² + b²)) − π/2,  roll = s − t,  yaw = s + t
+ *   at a pitch of ±π/2 roll and yaw turn about the same axis: roll = 0, and yaw = 2·t or 2·s
  *
  * Failure: Cannot fail. A quaternion of zeros, or one that is not finite, gives outputs that are not.
  */
@@ -55,14 +55,19 @@ static int step_to_quaternion(struct fl_block *block)
 
 static int step_to_angles(struct fl_block *block)
 {
+    const double pi = 3.14159265358979323846, upright = 1e-14; /* of the length: less is rounding */
     const double *in = block->in[0];
     const double x = in[0], y = in[1], z = in[2], w = in[3];
-    const double length2 = x * x + y * y + z * z + w * w;
-    const double lost = length2 > 0 && isfinite(length2) ? 0 : NAN;
-    const double sine = 2 * (w * y - z * x) / length2; /* rounding may leave it beyond 1 */
-    FL_OUT(block, ROLL, double) = lost + atan2(2 * (w * x + y * z), w * w - x * x - y * y + z * z);
-    FL_OUT(block, PITCH, double) = lost + asin(fmax(-1, fmin(sine, 1)));
-    FL_OUT(block, YAW, double) = lost + atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z);
+    const double up = hypot(w + y, z - x), down = hypot(w - y, x + z), length = hypot(up, down);
+    const double lost = length > 0 && isfinite(length) ? 0 : NAN;
+    double sum = atan2(x + z, w - y), difference = atan2(z - x, w + y);
+    if (down <= upright * length)
+        sum = difference;
+    else if (up <= upright * length)
+        difference = sum;
+    FL_OUT(block, ROLL, double) = lost + remainder(sum - difference, 2 * pi);
+    FL_OUT(block, PITCH, double) = lost + 2 * atan2(up, down) - pi / 2;
+    FL_OUT(block, YAW, double) = lost + remainder(sum + difference, 2 * pi);
     return FL_OK;
 }
 
@@ -80,7 +85,7 @@ FL_BLOCK(quaternion_to_angles) = {
     .abi = FL_ABI,
     .name = "quaternion-to-angles",
     .summary = "roll, pitch and yaw of a quaternion",
-    .source = "Diebel, Representing Attitude: Euler Angles, Unit Quaternions, and Rotation Vectors (2006); REP 103",
+    .source = "Bernardes and Viollet, Quaternion to Euler angles conversion, PLOS ONE 17(11), 2022; REP 103",
     FL_TABLE(input, quaternion),
     FL_TABLE(output, angle_outputs),
     .step = step_to_angles,
