@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import time
@@ -80,6 +81,24 @@ def run(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path, link: Li
     return lambda text, watched=WATCHED, name="task": running(
         [flotilla_run, "--watch", watched], tmp_path / f"{name}.yml", text, environment
     )
+
+
+@pytest.fixture
+def safe(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path, link: Link) -> Callable[[str], int]:
+    """What the service manager runs after a task; its status."""
+    environment = {
+        **os.environ,
+        "LD_PRELOAD": str(udp_can),
+        "CAN_HUB": str(hub.port),
+        "CAN_LINK": str(tmp_path / "link"),
+    }
+
+    def make_safe(text: str) -> int:
+        (tmp_path / "task.yml").write_text(text)
+        command = [flotilla_run, "--safe", "task.yml"]
+        return subprocess.run(command, cwd=tmp_path, env=environment, timeout=PATIENCE, check=False).returncode
+
+    return make_safe
 
 
 def drive_task(mode: str, target: float, more: str = "") -> str:
@@ -241,6 +260,45 @@ def test_a_motor_that_stopped_stays_off(run: Any, hub: UdpHub, link: Link, cause
             assert drive.axis is Axis.SWITCH_ON_DISABLED
     with server.paused():
         assert drive.motor.current == 0
+
+
+class Watched(Epos2):
+    """A drive that notes each state, and at what speed the motor was (rpm)."""
+
+    def __init__(self, node: int) -> None:
+        self.way: list[tuple[Axis, float]] = []
+        super().__init__(node)
+
+    def _cycle(self) -> None:
+        if not self.way or self.way[-1][0] is not self.axis:
+            self.way.append((self.axis, abs(self.motor.rpm)))
+        super()._cycle()
+
+
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [(signal.SIGTERM, 0), (signal.SIGSEGV, -signal.SIGSEGV), (signal.SIGKILL, -signal.SIGKILL)],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_the_end_stops_the_motor_before_it_loses_its_power(
+    run: Any, safe: Callable[[str], int], hub: UdpHub, end: signal.Signals, status: int
+) -> None:
+    """Whatever the end is; after a kill it is the service manager's `--safe` that does it, and after a crash, too.
+
+    Seen to fail: the motor ran out from 475 rpm, without power.
+    """
+    drive, text = Watched(NODE), drive_task("velocity", 5).replace("heartbeat: 1,", "heartbeat: 60,")
+    server = Epos2Server(hub, drive)
+    with server.running():
+        with run(text) as task:
+            task.until(lambda row: row["velocity"] > 4.5)
+            task.signal(end)
+            assert task.wait() == status
+        assert status == 0 or safe(text) == 0
+        await_axis(server, drive, Axis.SWITCH_ON_DISABLED)
+    (stopping, before), (last, after) = drive.way[-2:]
+    assert (stopping, last) == (Axis.QUICK_STOP_ACTIVE, Axis.SWITCH_ON_DISABLED), drive.way
+    assert after < 6 < before, drive.way
 
 
 def test_the_end_stops_a_drive_with_other_settings(run: Any, hub: UdpHub) -> None:

@@ -660,19 +660,32 @@ size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_com
     return count;
 }
 
-size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])
+/* By every way there is. */
+static size_t command_all(const struct epos2 *drive, uint16_t word, struct can_frame out[EPOS2_FRAMES])
 {
-    const struct epos2_write word = {0x6040, 0, 2, DISABLE_VOLTAGE};
-    out[0] = command_frame(drive, DISABLE_VOLTAGE, idle_target(drive));
+    const struct epos2_write write = {0x6040, 0, 2, word};
+    out[0] = command_frame(drive, word, idle_target(drive));
     out[1] = frame_of(COB_RPDO1 + drive->settings.node, 2);
-    put(out[1].data, 2, DISABLE_VOLTAGE);
-    out[2] = sdo(drive, &word);
+    put(out[1].data, 2, word);
+    out[2] = sdo(drive, &write);
     return 3;
+}
+
+size_t epos2_quick_stop(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])
+{
+    return command_all(drive, QUICK_STOP, out);
+}
+
+bool epos2_powered(const struct epos2 *drive)
+{
+    enum axis axis = axis_of(drive->status_word);
+    return drive->phase == EPOS2_RUNNING &&
+           (!drive->status_known || axis == OPERATION_ENABLED || axis == QUICK_STOP_ACTIVE || axis == FAULT_REACTION);
 }
 
 size_t epos2_shutdown(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES])
 {
-    size_t count = epos2_disable(drive, out);
+    size_t count = command_all(drive, DISABLE_VOLTAGE, out);
     out[count++] = nmt(drive, NMT_RESET_COMMUNICATION);
     return count;
 }

@@ -148,12 +148,16 @@ void epos2_receive(struct epos2 *drive, const struct can_frame *frame, int64_t a
 size_t epos2_advance(struct epos2 *drive, int64_t now_ns, const struct epos2_command *command,
                      struct can_frame out[EPOS2_FRAMES]);
 
-/* Write the frames that take the power off the motor, in every phase: by the PDO of commands, by RPDO1, which carries
- * the control word alone, and by SDO, which no setting of the drive changes. So this also stops a drive that an earlier
- * program left running. */
-size_t epos2_disable(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
+/* Write the frames of a quick stop, in every phase: by the PDO of commands, by RPDO1, which carries the control word
+ * alone, and by SDO, which no setting of the drive changes. So this also stops a drive that an earlier program left
+ * running. In every state but operation it takes the power off. */
+size_t epos2_quick_stop(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
 
-/* Write the last frames: power off, and no monitoring of our heartbeats any more. */
+/* The motor has power, as far as is known of a drive that works: epos2_advance without `enable` stops it, and then
+ * takes its power off. */
+bool epos2_powered(const struct epos2 *drive);
+
+/* Write the last frames: power off, in every phase, and no monitoring of our heartbeats any more. */
 size_t epos2_shutdown(const struct epos2 *drive, struct can_frame out[EPOS2_FRAMES]);
 
 /* The position is that from the home, or no homing is asked for. */

@@ -9,15 +9,16 @@
  *   motor speed in rpm = gear·60/(2π)·speed of the gear's output in rad/s
  *
  * Failure: A command whose `age` is beyond `timeout`, or that is not finite, stops the motor by a quick stop. When the
- * task ends, in whatever way, the power is taken off the motor; a task that cannot do so is noticed by the drive,
- * which stops the motor after `heartbeat` without a sign of the block. The flag is 0 while the drive is not in
- * operation, silent for longer than `heartbeat`, or has sent no values for `timeout`, and while the interface is
- * missing or down. While the flag is 0 the values stay the last good ones, and `age` grows. After a fault, or after
- * the drive or the bus was lost, the motor stays off until `enable` goes from 0 to 1, or comes back by itself with
- * `restart: automatic`. The journal says the first cause. With `homing`, `enabled` is 0 until the drive has found its
- * home. A search that fails or exceeds `homing_timeout` switches the motor off until `enable` goes from 0 to 1,
- * whatever `restart` is, and the journal names it.
+ * task ends, in whatever way, it does, too; the power is taken off once the motor stands, after 0.8 s at the latest. A
+ * task that cannot do so is noticed by the drive, which stops the motor after `heartbeat` without a sign of the block.
+ * The flag is 0 while the drive is not in operation, silent for longer than `heartbeat`, or has sent no values for
+ * `timeout`, and while the interface is missing or down. While the flag is 0 the values stay the last good ones, and
+ * `age` grows. After a fault, or after the drive or the bus was lost, the motor stays off until `enable` goes from 0 to
+ * 1, or comes back by itself with `restart: automatic`. The journal says the first cause. With `homing`, `enabled` is 0
+ * until the drive has found its home. A search that fails or exceeds `homing_timeout` switches the motor off until
+ * `enable` goes from 0 to 1, whatever `restart` is, and the journal names it.
  */
+#define _GNU_SOURCE
 #include "epos2.h"
 #include "epos2_text.h"
 #include "socket.h"
@@ -25,6 +26,7 @@
 
 #include <flotilla/sensor.h>
 #include <math.h>
+#include <time.h>
 
 struct epos2_block {
     const char *interface;
@@ -46,6 +48,7 @@ struct state {
     struct epos2_trouble known; /* the step has put into it */
     struct epos2_trouble now, logged;
     int64_t since_ns; /* of `now` */
+    int64_t safe_ns;  /* the quick stop at the end was sent; 0: it was not */
 };
 
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
@@ -307,14 +310,25 @@ static void follow_interface(struct state *state)
     state->connections = connections;
 }
 
+/* Take what came; whether anything did. */
+static bool take_all(struct state *state)
+{
+    struct can_frame frame;
+    int64_t arrived_ns;
+    int taken = 0;
+    while (taken < SOCKET_BURST && can_receive(&state->can, &frame, &arrived_ns)) {
+        epos2_receive(&state->drive, &frame, arrived_ns);
+        taken++;
+    }
+    return taken > 0;
+}
+
 static int step(struct fl_block *block)
 {
     const struct epos2_block *set = block->parameters;
     struct state *state = block->state;
-    struct can_frame frame, out[EPOS2_FRAMES];
-    int64_t arrived_ns;
-    for (int i = 0; i < SOCKET_BURST && can_receive(&state->can, &frame, &arrived_ns); i++)
-        epos2_receive(&state->drive, &frame, arrived_ns);
+    struct can_frame out[EPOS2_FRAMES];
+    take_all(state);
     bool fresh = FL_IN(block, COMMAND_AGE, double) <= set->timeout, enable = FL_IN(block, ENABLE, uint8_t);
     bool commanded = fresh && (!fl_wired(block, COMMAND_FLAG) || FL_IN(block, COMMAND_FLAG, bool));
     struct epos2_command command = {.enable = fl_may_act(block, commanded && !enable) && enable,
@@ -333,14 +347,46 @@ static void safe(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    if (!send_all(state, out, epos2_disable(&state->drive, out)))
+    if (!send_all(state, out, epos2_quick_stop(&state->drive, out)))
         fl_not_safe(block, "the drive could not be reached by the CAN bus");
+    if (!state->safe_ns)
+        state->safe_ns = fl_now_ns();
+}
+
+/* After the quick stop: wait until the motor stands and its power is off, or may be taken off. A drive that does not
+ * work, or works for an earlier program, is commanded again and again, as long as it says anything. */
+static void await_rest(struct fl_block *block)
+{
+    enum { PERIOD_MS = 10, AGAIN_MS = 100, SILENT_MS = 300, LONGEST_MS = 800 /* a watchdog waits for a second */ };
+    const int64_t ms = 1000000;
+    const struct epos2_block *set = block->parameters;
+    struct state *state = block->state;
+    /* The block that sends SYNC may have ended before this one. */
+    const struct epos2_command off = {.sync = set->sync == 0, .target = (double)NAN};
+    struct can_frame out[EPOS2_FRAMES];
+    int64_t now_ns = fl_now_ns(), heard_ns = now_ns, sent_ns = 0;
+    while (can_connected(&state->can) && now_ns - state->safe_ns < LONGEST_MS * ms) {
+        bool works = state->drive.phase == EPOS2_RUNNING;
+        if (take_all(state))
+            heard_ns = now_ns;
+        if (works ? !epos2_powered(&state->drive) : now_ns - heard_ns > SILENT_MS * ms)
+            return;
+        if (works || now_ns - sent_ns > AGAIN_MS * ms) {
+            sent_ns = now_ns;
+            send_all(state, out,
+                     works ? epos2_advance(&state->drive, now_ns, &off, out) : epos2_quick_stop(&state->drive, out));
+        }
+        nanosleep(&(struct timespec){.tv_nsec = PERIOD_MS * 1000000L}, NULL);
+        now_ns = fl_now_ns();
+    }
 }
 
 static void terminate(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
+    if (state->safe_ns)
+        await_rest(block);
     send_all(state, out, epos2_shutdown(&state->drive, out));
     can_stop(&state->can);
     can_sync_release(&state->sync);

@@ -849,22 +849,29 @@ static void offers_positions_by_edges(void **state)
     test_free(stub);
 }
 
-static void disables_at_once(void **state)
+static void stops_by_every_way_and_then_disables(void **state)
 {
     (void)state;
     struct can_frame out[EPOS2_FRAMES];
     struct stub *stub = enabled(usual);
-    assert_int_equal(epos2_disable(&stub->engine, out), 3);
+    assert_int_equal(epos2_quick_stop(&stub->engine, out), 3);
     assert_int_equal(out[0].can_id, 0x505); /* the PDO of the commands */
     assert_int_equal(out[0].len, 6);
-    assert_memory_equal(out[0].data, "\0\0", 2);
+    assert_memory_equal(out[0].data, "\2\0", 2);
     assert_int_equal(out[1].can_id, 0x205);
     assert_int_equal(out[1].len, 2);
-    assert_memory_equal(out[1].data, "\0\0", 2);
+    assert_memory_equal(out[1].data, "\2\0", 2);
     assert_int_equal(out[2].can_id, 0x605); /* an SDO */
-    assert_memory_equal(out[2].data, "\x2B\x40\x60\0\0\0\0\0", 8);
+    assert_memory_equal(out[2].data, "\x2B\x40\x60\0\2\0\0\0", 8);
+    assert_true(epos2_powered(&stub->engine));
+    stub->command.enable = false;
+    periods(stub, 10);
+    assert_false(epos2_powered(&stub->engine));
     assert_int_equal(epos2_shutdown(&stub->engine, out), 4);
     assert_int_equal(out[0].can_id, 0x505);
+    assert_memory_equal(out[0].data, "\0\0", 2);
+    assert_memory_equal(out[1].data, "\0\0", 2);
+    assert_memory_equal(out[2].data, "\x2B\x40\x60\0\0\0\0\0", 8);
     assert_int_equal(out[3].can_id, 0);
     assert_memory_equal(out[3].data, "\x82\x05", 2);
     test_free(stub);
@@ -964,7 +971,7 @@ int main(void)
         cmocka_unit_test(two_heartbeats_may_be_lost),
         cmocka_unit_test(a_heartbeat_comes_before_any_motion),
         cmocka_unit_test(offers_positions_by_edges),
-        cmocka_unit_test(disables_at_once),
+        cmocka_unit_test(stops_by_every_way_and_then_disables),
         cmocka_unit_test(ignores_what_is_not_the_drives),
         cmocka_unit_test(survives_any_frames),
     };
