@@ -95,7 +95,7 @@ def safe(flotilla_run: Path, udp_can: Path, hub: UdpHub, tmp_path: Path, link: L
 
     def make_safe(text: str) -> int:
         (tmp_path / "task.yml").write_text(text)
-        command = [flotilla_run, "--safe", "task.yml"]
+        command = [str(flotilla_run), "--safe", "task.yml"]
         return subprocess.run(command, cwd=tmp_path, env=environment, timeout=PATIENCE, check=False).returncode
 
     return make_safe

@@ -19,15 +19,22 @@ struct state {
     double *values;
 };
 
-enum { OUT, ON };
+enum { OUT, ON, BYTES, COUNT };
 
 static int configure(struct fl_block *block)
 {
     const struct table *set = block->parameters;
     uint32_t width = (uint32_t)set->width;
-    if (fl_add_output(block, (struct fl_port){.name = "out", .type = FL_DOUBLE, .width = width}) != FL_OK)
-        return FL_FAILED;
-    return fl_add_output(block, (struct fl_port){.name = "on", .type = FL_BOOLEAN, .width = width});
+    const struct fl_port outputs[] = {
+        {.name = "out", .type = FL_DOUBLE, .width = width, .summary = "the row"},
+        {.name = "on", .type = FL_BOOLEAN, .width = width, .summary = "out > 0.5"},
+        {.name = "bytes", .type = FL_UINT8, .width = width, .summary = "out, of 0 to 255"},
+        {.name = "count", .type = FL_UINT32, .width = 1, .summary = "rows so far"},
+    };
+    for (size_t i = 0; i < sizeof outputs / sizeof outputs[0]; i++)
+        if (fl_add_output(block, outputs[i]) != FL_OK)
+            return FL_FAILED;
+    return FL_OK;
 }
 
 static int start(struct fl_block *block)
@@ -51,8 +58,11 @@ static int step(struct fl_block *block)
     int64_t row = (int64_t)block->step < set->rows ? (int64_t)block->step : set->rows - 1;
     const double *values = state->values + row * set->width;
     memcpy(block->out[OUT], values, (size_t)set->width * sizeof *values);
-    for (int64_t i = 0; i < set->width; i++)
+    for (int64_t i = 0; i < set->width; i++) {
         ((bool *)block->out[ON])[i] = values[i] > 0.5;
+        ((uint8_t *)block->out[BYTES])[i] = values[i] > 0 && values[i] < 256 ? (uint8_t)values[i] : 0;
+    }
+    FL_OUT(block, COUNT, uint32_t) = (uint32_t)block->step + 1;
     return FL_OK;
 }
 
