@@ -357,6 +357,7 @@ def main() -> None:
         },
         "clock": clock(),
         "release": json.loads(output("flotilla-slot", "show") or "null"),
+        "data_is_writable": not data.f_flag & os.ST_RDONLY,
         "data_free_bytes": data.f_bavail * data.f_frsize,
         "boot_id": read("/proc/sys/kernel/random/boot_id").strip(),
     }

@@ -113,6 +113,7 @@ class State(_Answer):
     failed: list[Text]
     tasks: dict[Word, Task]
     release: Release | None
+    data_is_writable: bool
     data_free_bytes: Count
 
 

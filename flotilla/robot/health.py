@@ -1,4 +1,4 @@
-"""Whether a robot is healthy by what its control tasks say of themselves, and the inventory asks of them.
+"""Whether a robot is healthy by its data partition and by what its control tasks report, and the inventory requires.
 
 `library/robot_state.py` brings what they say; units, files and settings are judged where they are compared.
 """
@@ -14,6 +14,10 @@ from flotilla.common.errors import UserError
 from flotilla.fleet.model import Health
 
 _UNIT = "flotilla-task@"
+READ_ONLY = (
+    "/data is read-only after an error of its file system: restart the robot, which checks it; if that happens again, "
+    "replace the card"
+)
 
 
 def policy(given: Any) -> Health:
@@ -30,9 +34,13 @@ def _why(detail: Any) -> str:
     return f"{context['message']}; {context['remedy']}" if "remedy" in context else str(detail["msg"])
 
 
-def complaints(tasks: Mapping[str, Any], wanted: Health) -> list[str]:
-    """What is wrong, in words; nothing where the robot is healthy. `tasks`: by unit, as `robot_state` says them."""
-    return [each for unit, task in sorted(tasks.items()) for each in _of_task(unit, task.get("status"), wanted)]
+def complaints(state: Mapping[str, Any], wanted: Health) -> list[str]:
+    """What is wrong, in words; nothing where the robot is healthy. `state`: what `robot_state` found."""
+    tasks = sorted(state["tasks"].items())
+    return [
+        *([] if state["data_is_writable"] else [READ_ONLY]),
+        *(each for unit, task in tasks for each in _of_task(unit, task.get("status"), wanted)),
+    ]
 
 
 def _of_task(unit: str, status: Any, wanted: Health) -> Iterator[str]:

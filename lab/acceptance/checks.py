@@ -77,7 +77,7 @@ def _description(asked: Asked) -> Iterator[Outcome]:
         yield Outcome(part=part, what="release", state="not judged", found=absent)
     else:
         yield _outcome(part, "release", [drift] if drift else [], "the one of its image on this computer", "")
-    complaints = health.complaints(found["tasks"], asked.fleet.health)
+    complaints = health.complaints(found, asked.fleet.health)
     tasks = len(found["tasks"])
     yield _outcome(
         part, "health", complaints, f"{tasks} control tasks are as `health:` wants", "look at them: make top ASK=1"

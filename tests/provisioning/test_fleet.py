@@ -23,7 +23,7 @@ import yaml
 
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet, Robot
-from flotilla.robot import ssh
+from flotilla.robot import health, ssh
 from lab.qemu import saved
 from lab.qemu import virtual_fleet as virtual
 from lab.qemu.guest import Guest
@@ -184,6 +184,8 @@ def test_a_robots_own_report_stops_the_roll_out(guests: Guests) -> None:
     done = guests.play("-l", "robot1", playbook="tasks")
     assert " overruns in " in done.said
     assert "gyro flag 0" in done.said
+    guests.sudo("robot1", "echo planted >/sys/fs/ext4/$(basename $(findmnt -no SOURCE /data))/trigger_fs_error")
+    assert unhealthy() == health.READ_ONLY
 
 
 def test_drift_is_shown_mended_and_gone(guests: Guests) -> None:

@@ -44,7 +44,7 @@ HEALTHY: dict[str, Any] = {
     "drift": [], "hostname": "robot", "machine": "i686", "uarts": [f"ttyS{number}" for number in range(16)],
     "users": ["root"], "addresses": [], "firewall_is_loaded": False, "sysctl": [], "apps": {}, "down": [],
     "superfluous_tasks": [], "failed": [], "tasks": {}, "clock": {"synchronised": False, "offset_s": None},
-    "release": None, "data_free_bytes": 1 << 30, "boot_id": "x",
+    "release": None, "data_is_writable": True, "data_free_bytes": 1 << 30, "boot_id": "x",
 }  # fmt: skip
 """So far that playbooks go on: its rules of the firewall are others."""
 

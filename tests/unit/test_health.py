@@ -45,7 +45,12 @@ def tasks(steps: int = 100, overruns: int = 0, **flags: bool) -> dict[str, Any]:
 )
 def test_complaints(there: dict[str, Any], wanted: Health, said: list[str]) -> None:
     """Seen to fail with every silent sensor a fault, and with any overrun one."""
-    assert health.complaints(there, wanted) == said
+    assert health.complaints({"tasks": there, "data_is_writable": True}, wanted) == said
+
+
+def test_a_data_partition_that_is_read_only_is_unhealthy() -> None:
+    """Seen to fail: such a robot was healthy, and a roll-out went on to the next wave."""
+    assert health.complaints({"tasks": tasks(), "data_is_writable": False}, Health()) == [health.READ_ONLY]
 
 
 @pytest.mark.parametrize(
@@ -72,4 +77,4 @@ def test_guests_are_not_judged_by_their_hosts_time_nor_by_empty_ports(tmp_path: 
     # Ansible refuses a standard error that some ssh before has left non-blocking.
     said = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
     wanted = health.policy(json.loads(said)["health"])
-    assert health.complaints(tasks(overruns=100, gyro=False), wanted) == []
+    assert health.complaints({"tasks": tasks(overruns=100, gyro=False), "data_is_writable": True}, wanted) == []

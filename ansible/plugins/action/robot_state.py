@@ -19,7 +19,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
     `wanted`: what the inventory says. `release_drift`: in words, how root, kernel or runtime differ from the image's.
     `faults`: by role, what is wrong besides files. `up_to_date`: there is no drift and no fault. `app_actions`: what
     the role `apps` has to do. `by_hand`: words on apps that the robot has beside the inventory's. `unhealthy`: what the
-    variable `health` does not permit of what control tasks say of themselves.
+    variable `health` does not permit of what control tasks report, and a data partition that is read-only.
     """
 
     _supports_check_mode = True
@@ -57,6 +57,6 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             "by_hand": judged.notes,
             "warnings": [f"{robot.name}: {note}" for note in judged.notes],
             "up_to_date": not found["drift"] and not any(faults.values()),
-            "unhealthy": health.complaints(found["tasks"], policy),
+            "unhealthy": health.complaints(found, policy),
             "release_drift": state.release_drift(found["release"], release.wanted(robot)),
         }
