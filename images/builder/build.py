@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -132,8 +131,6 @@ def check_tasks(fleet: Fleet, robots: list[Robot]) -> None:
 class _Common:
     """What is the same for all cards of a board, found once while the first is made."""
 
-    beginning: Future[hashlib._Hash]
-    """SHA-256 up to the data partition, to be gone on with from a copy."""
     ranges: Future[bmap.BlockMap]
     inputs: Future[str]
     source: Future[manifest.Source | str]
@@ -142,7 +139,6 @@ class _Common:
     def of(cls, made: BoardBuild, source: Future[manifest.Source | str], threads: ThreadPoolExecutor) -> _Common:
         image = made.base / "card.img"
         return cls(
-            threads.submit(manifest.hash_range, image, 0, card.DATA.start),
             threads.submit(bmap.block_map, image, card.extents(made.base)),
             threads.submit(manifest.inputs_of_board, made.board, (made.lock, made.tools_lock)),
             source,
@@ -202,13 +198,14 @@ def _robot_image(
     try:
         extents = card.begin(made.base, new, past_page_cache=many)
         extents += card.complete(made.board, made.tools, new, nodes, made.lock.epoch)
-        mapped = bmap.write_bmap(new, extents, bmap.bmap_of(new), common.ranges.result().ranges).mapped
+        same = card.without_identifier(common.ranges.result().ranges)
+        mapped = bmap.write_bmap(new, extents, bmap.bmap_of(new), same).mapped
+        boot_loader = manifest.part("boot loader", new, 0, card.STATE.start)
         data_part = manifest.part("data partition", new, card.DATA.start, card.DATA.size)
-        beginning = common.beginning.result().copy()
-        whole = manifest.hash_range(new, card.DATA.start, card.DATA.size, beginning).hexdigest()
+        whole = manifest.hash_range(new, 0, card.SIZE).hexdigest()
         manifest.write(
             fleet, robot, (made.lock, made.tools_lock), made.manifest, board_inputs=common.inputs.result(),
-            nodes=nodes, source=common.source.result(), data=data_part,
+            nodes=nodes, source=common.source.result(), boot_loader=boot_loader, data=data_part,
             image=manifest.Part(name=final.name, bytes=card.SIZE, sha256=whole), extents=extents,
             apps=apps, beside=new,
         )  # fmt: skip

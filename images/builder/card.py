@@ -1,7 +1,7 @@
 """The card: boot loader, boot state, slots A and B, data partition. A file, made without loop device or mount.
 
-All cards of a board are the same up to the data partition: `base` makes that part once, `begin` copies it, `complete`
-adds a robot's data. What is in a slot, `slot.py` makes.
+All cards of a board are the same up to the data partition, but for the identifier of the disk: `base` makes that part
+once, `begin` copies it, `complete` adds a robot's data and identifier. What is in a slot, `slot.py` makes.
 
 | from | what |
 |---|---|
@@ -14,7 +14,8 @@ adds a robot's data. What is in a slot, `slot.py` makes.
 | then | data (ext4): the robot's identity, then all that changes; grows to the card on first boot |
 | then | with UEFI: the GPT's copy, which the first boot moves to the end of the card |
 
-`images/boot/card.yml` says the identifier and the sizes.
+`images/boot/card.yml` has the sizes. The identifier is the robot's, so that of two cards in a computer each boots its
+own: GRUB reads it from the disk that it came from, and gives the kernel the root partition by it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import os
 import struct
 import tarfile
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -34,12 +36,14 @@ import pydantic
 from flotilla.common import cache, host, paths, yaml_file
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Integer, between
-from images.builder import copying, environment_block, filesystem, uefi
+from images.builder import bmap, copying, environment_block, filesystem, uefi
 from images.builder.filesystem import Node
 from images.builder.tools import Tools
 
 MIB = 1 << 20
-_GRUB_MODULES = "memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot iorw"
+_GRUB_MODULES = (
+    "memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot iorw regexp probe"
+)
 
 
 class _Grub(NamedTuple):
@@ -50,7 +54,7 @@ class _Grub(NamedTuple):
     """Beside `_GRUB_MODULES`."""
 
 
-_GRUB = {"bios": _Grub("i386-pc", "biosdisk part_msdos"), "uefi": _Grub("x86_64-efi", "part_gpt regexp efi_gop")}
+_GRUB = {"bios": _Grub("i386-pc", "biosdisk part_msdos"), "uefi": _Grub("x86_64-efi", "part_gpt efi_gop")}
 _GRUB_TEMPLATE = paths.PROJECT / "images" / "boot" / "grub.cfg.j2"
 _LAYOUT = paths.PROJECT / "images" / "boot" / "card.yml"
 _DATA_UUID = "5b0e4a3c-6f1d-4c58-9d0a-000000000004"
@@ -64,8 +68,6 @@ class Layout(pydantic.BaseModel):
         Integer, between(1, 1000, "a number that rises with each change of the card that an update cannot make")
     ]
     """Number of the layout. A robot takes updates for its own only."""
-    disk_id: Annotated[Integer, between(1, 0xFFFFFFFF, "four bytes, of which no other disk in a robot has the same")]
-    """MBR identifier of every card."""
     slot_mib: Annotated[Integer, between(32, 16384, unit="MiB")]
     """Size of each of the two slots."""
     data_mib: Annotated[Integer, between(8, 16384, unit="MiB")]
@@ -86,18 +88,25 @@ class Partition:
     size: int
     """Bytes."""
 
-    def partuuid(self, board: Board) -> str:
-        """What `root=PARTUUID=` calls it on a card of the board."""
-        return guid(self.number) if board.firmware == "uefi" else f"{LAYOUT.disk_id:08x}-{self.number:02}"
+    def partuuid(self, board: Board, disk_id: int) -> str:
+        """What `root=PARTUUID=` calls it on a card of the board with this identifier."""
+        return guid(disk_id, self.number) if board.firmware == "uefi" else f"{disk_id:08x}-{self.number:02}"
 
     @property
     def end(self) -> int:
         return self.start + self.size
 
 
-def guid(number: int) -> str:
-    """Of a partition in a GPT; 0: of the card. As the identifier in an MBR, all cards have the same."""
-    return f"{LAYOUT.disk_id:08x}-0000-4000-8000-{number:012}"
+def guid(disk_id: int, number: int) -> str:
+    """Of a partition in a GPT; 0: of the card."""
+    return f"{disk_id:08x}-0000-4000-8000-{number:012}"
+
+
+def disk_id(nodes: list[Node]) -> int:
+    """The identifier of a robot's card, 32 bits in the MBR or the beginning of each GUID in the GPT: the beginning of
+    the robot's machine ID."""
+    (machine_id,) = (node.content for node in nodes if node.path.name == "machine-id" and node.content)
+    return int(machine_id[:8], 16) or 1  # 0: no identifier, for the kernel
 
 
 REGION = 4 * MIB
@@ -116,19 +125,26 @@ TRIES = SECTOR
 COPIES = [REGION, 2 * REGION]
 """Where the copies of the state lie in it."""
 
-COMMON_ARGUMENTS = ["ro", "rootfstype=squashfs", "init=/usr/lib/flotilla/preinit", "net.ifnames=0", "panic=10",
+COMMON_ARGUMENTS = ["ro", "rootfstype=squashfs", "init=/usr/lib/flotilla/preinit", "net.ifnames=0", "panic=1",
+                    "sysctl.kernel.sysrq=0",
                     "cpufreq.default_governor=performance", "cryptomgr.notests", "noisapnp", "quiet"]  # fmt: skip
-"""Kernel command line of every card; the board adds its own. The kernel's self-tests of its ciphers take two seconds of
-each boot under emulation, and more on the board; to look for ISA cards without jumpers, a third of one."""
+"""Kernel command line of every card; the board adds its own.
 
-HEADER_ROOM = 4096
-"""Before a slot's end: there its header begins."""
+Self-tests of the kernel's ciphers take two seconds of each boot under emulation, and more on the board; a search for
+ISA cards without jumpers takes a third of a second. A panic restarts the robot after a second, because until then its
+outputs stay as they are. Without SysRq a break on the serial line and a letter, as a plug or noise makes them, neither
+restart nor stop the robot. Debian's kernel takes both for a command, and so does our own."""
+
+HEADER_ROOM, HEADER_BYTES = 4096, 1024
+"""Before a slot's end: there its header begins, of so many bytes."""
 _TYPES = {"state": 0xDA, "A": 0x83, "B": 0x83, "data": 0x83}
 """Of partitions, in the MBR: 0xDA is data without a file system."""
 _GPT_TYPES = {"system": "C12A7328-F81F-11D2-BA4B-00A0C93EC93B"} | dict.fromkeys(
     _TYPES, "0FC63DAF-8483-4772-8E79-3D69D8477DE4"
 )
 """Of partitions, in a GPT: UEFI's system partition, and data of Linux, which no other system touches."""
+_MBR_ID = 440
+"""Where the identifier lies in an MBR."""
 _GPT_HEAD, _GPT_TAIL = 34 * 512, MIB
 """Bytes at the beginning of an image, an MBR that protects it, header and 128 entries; at its end, for their copy."""
 
@@ -181,7 +197,7 @@ def base(board: Board, slot: Path, tools: Tools, epoch: int) -> Path:
         blocks = [(STATE.start, tries_block())] + [(STATE.start + place, state_copy()) for place in COPIES]
         blocks += [
             (SLOTS[0].end - HEADER_ROOM, header),
-            (SLOTS[1].end - HEADER_ROOM, bytes(HEADER_ROOM)),
+            (SLOTS[1].end - HEADER_ROOM, environment_block.make({}, HEADER_BYTES)),
             *boot_loader(board, tools, out, grub_core(board, tools, out, grub_config(board))),
         ]
         with (out / "card.img").open("wb") as card:
@@ -204,16 +220,16 @@ def boot_loader(board: Board, tools: Tools, work: Path, core: bytes) -> list[tup
     """
     if board.firmware == "bios":
         return [(0, _boot_sector(tools)), (SECTOR, core)]
-    head, tail = _gpt(board, tools, work / "gpt")
+    head, tail = _gpt(board, tools, work / "gpt", 0)
     return [(0, head), (SYSTEM.start, uefi.system_partition(tools, work, SYSTEM.size, core)), (SIZE - len(tail), tail)]
 
 
-def _gpt(board: Board, tools: Tools, work: Path) -> tuple[bytes, bytes]:
-    """Beginning and end of a card with a GPT."""
-    lines = ["label: gpt", f"label-id: {guid(0)}", "unit: sectors", "first-lba: 34", "table-length: 128"]
+def _gpt(board: Board, tools: Tools, work: Path, disk_id: int) -> tuple[bytes, bytes]:
+    """Beginning and end of a card with a GPT. `work`: a file for what is thrown away."""
+    lines = ["label: gpt", f"label-id: {guid(disk_id, 0)}", "unit: sectors", "first-lba: 34", "table-length: 128"]
     lines += [
         f"{one.number}: start={one.start // SECTOR}, size={one.size // SECTOR}, name={one.name}, "
-        f"type={_GPT_TYPES[one.name]}, uuid={one.partuuid(board)}"
+        f"type={_GPT_TYPES[one.name]}, uuid={one.partuuid(board, disk_id)}"
         for one in sorted(partitions(board), key=lambda one: one.number)
     ]
     with work.open("wb") as card:
@@ -267,8 +283,27 @@ def begin(base_directory: Path, out: Path, *, past_page_cache: bool = False) -> 
 
 
 def complete(board: Board, tools: Tools, card: Path, nodes: list[Node], epoch: int) -> Extents:
-    """Add the data partition with the robot's files to a card that `begin` made."""
+    """Add the data partition with the robot's files, and its identifier, to a card that `begin` made."""
+    identify(board, tools, card, disk_id(nodes))
     return data_partition(board, tools, card, nodes, epoch, DATA.start)
+
+
+def identify(board: Board, tools: Tools, card: Path, disk_id: int) -> None:
+    """Give a card its identifier."""
+    changes = [(_MBR_ID, struct.pack("<I", disk_id))]
+    if board.firmware == "uefi":
+        head, tail = _gpt(board, tools, card.with_suffix(".gpt"), disk_id)
+        changes = [(0, head), (SIZE - len(tail), tail)]
+    with card.open("r+b") as file:
+        for place, content in changes:
+            file.seek(place)
+            file.write(content)
+
+
+def without_identifier(ranges: Iterable[bmap.Range]) -> list[bmap.Range]:
+    """Of ranges of a board's cards those that are the same on all of them."""
+    first, last = _GPT_HEAD // bmap.BLOCK, (SIZE - _GPT_TAIL) // bmap.BLOCK
+    return [each for each in ranges if each.first > first and each.last < last]
 
 
 def data_partition(
@@ -296,10 +331,7 @@ def grub_config(board: Board) -> bytes:
     text: str = environment.from_string(_GRUB_TEMPLATE.read_text()).render(
         board=board,
         slots=SLOTS,
-        place=lambda partition: (
-            f"($disk,gpt{partition.number})" if board.firmware == "uefi" else f"(hd0,msdos{partition.number})"
-        ),
-        partuuid=lambda slot: slot.partuuid(board),
+        place=lambda partition: f"($disk,{'gpt' if board.firmware == 'uefi' else 'msdos'}{partition.number})",
         state_partition=STATE,
         tries=TRIES // SECTOR,
         copies=[place // SECTOR for place in COPIES],
@@ -346,4 +378,4 @@ def _boot_sector(tools: Tools) -> bytes:
         entries += struct.pack(
             "<B3sB3sII", status, chs, _TYPES[partition.name], chs, partition.start // 512, partition.size // 512
         )
-    return code + struct.pack("<IH", LAYOUT.disk_id, 0) + entries + b"\x55\xaa"
+    return code + bytes(6) + entries + b"\x55\xaa"  # without an identifier

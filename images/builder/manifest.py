@@ -212,11 +212,10 @@ def shared(board: Board, locks: tuple[Lock, Lock], root: Path, content: Path, ba
 
 def board_parts(root: Path, content: Path, base: Path) -> list[Part]:
     """What all cards of a board have in common, piece by piece."""
-    regions = {"boot loader": (0, card.STATE.start), "boot state": (card.STATE.start, card.STATE.size)}
-    parts = [part(name, base / "card.img", *region) for name, region in regions.items()]
+    state = part("boot state", base / "card.img", card.STATE.start, card.STATE.size)
     files = [root / name for name in ("vmlinuz", "initrd.img", "root.squashfs") if (root / name).exists()]
     files.append(content / "slot.img")
-    return parts + [part(file.name, file, 0, file.stat().st_size) for file in files]
+    return [state, *(part(file.name, file, 0, file.stat().st_size) for file in files)]
 
 
 def packages(status: str) -> list[Package]:
@@ -398,6 +397,7 @@ def write(
     nodes: list[Node],
     apps: Sequence[BuiltApp],
     source: Source | str,
+    boot_loader: Part,
     data: Part,
     image: Part,
     extents: card.Extents,
@@ -423,8 +423,8 @@ def write(
         source=None if isinstance(source, str) else source,
         source_unknown=source if isinstance(source, str) else "",
         image=image,
-        parts=[*same.parts, data],
-        partitions=partitions(board, extents),
+        parts=[boot_loader, *same.parts, data],
+        partitions=partitions(board, card.disk_id(nodes), extents),
         packages=same.packages,
         apps=[entry_of(app) for app in apps],
         hostvars=hostvars(fleet, robot),
@@ -493,14 +493,14 @@ def inputs(of_board: str, nodes: list[Node]) -> str:
     return cache.digest(of_board, *identity)
 
 
-def partitions(board: Board, extents: card.Extents) -> list[Partition]:
+def partitions(board: Board, disk_id: int, extents: card.Extents) -> list[Partition]:
     """The partition table, with how much of each partition the extents of a card fill."""
     contents = {"system": "fat", "state": "raw", "A": "squashfs", "B": "empty", "data": "ext4"}
     return [
         Partition(
             number=partition.number,
             name=partition.name,
-            partuuid=partition.partuuid(board),
+            partuuid=partition.partuuid(board, disk_id),
             content=contents[partition.name],
             start=partition.start,
             bytes=partition.size,

@@ -26,7 +26,6 @@ from flotilla.fleet.model import Board, Integer, between
 from images.builder import card, environment_block
 
 RELEASE_FILE = paths.PROJECT / "images" / "release.yml"
-HEADER_BYTES = 1024
 _ALIGNMENT = 4096
 _NAMES = {"KERNEL": "vmlinuz", "INITRD": "initrd.img", "KEYS": "release_keys"}
 """Parts behind the root: their names in the header, and as files."""
@@ -101,5 +100,5 @@ def write(board: Board, root: Path, keys: bytes, numbers: Release, out: Path) ->
         "ARGUMENTS": " ".join(card.kernel_arguments(board)),
     }
     (out / "header.json").write_text(json.dumps(header))
-    (out / "header").write_bytes(environment_block.make(header, HEADER_BYTES))
+    (out / "header").write_bytes(environment_block.make(header, card.HEADER_BYTES))
     (out / "release_keys").unlink()

@@ -16,7 +16,7 @@ from typing import Any
 
 from flotilla.common import paths
 from flotilla.fleet import release_keys
-from images.builder import bundle, card, environment_block, slot
+from images.builder import bundle, card, environment_block
 from images.builder.tools import Tools, command
 from lab.power_cuts import releases
 from lab.power_cuts.crash_states import CrashState
@@ -55,7 +55,7 @@ def held(image: Path) -> Held:
     first = card.SLOTS[0]
     with image.open("rb") as file:
         file.seek(header_sectors(first).start * SECTOR)
-        header = environment_block.values(file.read(slot.HEADER_BYTES))
+        header = environment_block.values(file.read(card.HEADER_BYTES))
         file.seek(first.start)
         return Held(header, file.read(int(header["BYTES"])))
 

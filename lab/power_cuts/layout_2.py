@@ -25,7 +25,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.common.processes import DIE_WITH_PARENT
 from flotilla.fleet.model import Board
-from images.builder import bundle, card, environment_block, slot
+from images.builder import bundle, card, environment_block
 from images.builder.tools import Tools
 from lab.power_cuts.releases import Release
 from lab.power_cuts.replay import Recording
@@ -66,7 +66,7 @@ def frame(number: int, content: bytes) -> bytes:
 
 
 def header_sectors(partition: card.Partition) -> range:
-    return sectors(partition.end - card.HEADER_ROOM, slot.HEADER_BYTES)
+    return sectors(partition.end - card.HEADER_ROOM, card.HEADER_BYTES)
 
 
 STATE_COPIES = [sectors(card.STATE.start + place, SECTOR) for place in card.COPIES]
@@ -126,7 +126,7 @@ def blob(release: Release, number: int, board: Board) -> Blob:
 
 def new_card(board: Board, tools: Tools, directory: Path, first: Blob) -> Path:
     """A card with this release in slot A; the builder's, all but the slot's content."""
-    header = environment_block.make(first.header, slot.HEADER_BYTES)
+    header = environment_block.make(first.header, card.HEADER_BYTES)
     digest = hashlib.sha256(first.content + header).hexdigest()
     content = directory / f"slot-{digest[:16]}"
     content.mkdir(parents=True, exist_ok=True)

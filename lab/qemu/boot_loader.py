@@ -6,12 +6,13 @@ with a header. A state of the card is a set of changed bytes.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from flotilla.fleet.model import Board
-from images.builder import card, environment_block, slot
+from images.builder import card, environment_block
 from lab.qemu.stub_computer import GAVE_UP, START_SECONDS, StubComputer, assemble_stub, slot_of
 
 _KERNEL, _INITRD = 0, 8
@@ -44,6 +45,9 @@ class StubCard:
             """The bytes of the card before its first partition."""
             self.state = file.read(card.STATE.size)
             """The boot state of the new card."""
+        gpt = self.head[512:520] == b"EFI PART"
+        (self.disk_id,) = struct.unpack_from("<I", self.head, 512 + 56 if gpt else 440)
+        """The card's identifier."""
         self.stub = assemble_stub(directory, release=False)
         self.stub += bytes(-len(self.stub) % card.SECTOR)
 
@@ -69,7 +73,16 @@ class StubCard:
             "INITRD": f"{_INITRD}+{sectors}",
             "ARGUMENTS": "quiet a=b",
         }
-        return environment_block.make(values | changed, slot.HEADER_BYTES)
+        return environment_block.make(values | changed, card.HEADER_BYTES)
+
+    def write(self, disk: Path, head: bytes | None = None) -> None:
+        """Write the card to a file; `head`: instead of its own bytes before the first partition."""
+        with disk.open("wb") as file:
+            file.truncate(card.SIZE)
+            file.write((head or self.head) + self.state)
+            for offset, content in self.slots.items():
+                file.seek(offset)
+                file.write(content)
 
     def with_core(self, core: bytes) -> bytes:
         """The bytes before the first partition, with another core image."""
@@ -102,21 +115,19 @@ class BootLoader(StubComputer):
         *,
         unreadable: Sequence[int] = (),
         head: bytes | None = None,
+        first: Path | None = None,
     ) -> None:
-        """`unreadable`: offsets on the card of sectors that fail when read; `head`: instead of the card's."""
+        """`unreadable`: offsets on the card of sectors that fail when read; `head`: instead of the card's; `first`:
+        another disk, before the card."""
         directory.mkdir(parents=True, exist_ok=True)
         self.board = board
+        self.disk_id = stubbed.disk_id
         self._disk = directory / "disk"
-        with self._disk.open("wb") as disk:
-            disk.truncate(card.SIZE)
-            disk.write((head or stubbed.head) + stubbed.state)
-            for offset, content in stubbed.slots.items():
-                disk.seek(offset)
-                disk.write(content)
+        stubbed.write(self._disk, head)
         self._before: dict[int, bytes] = {}
         self._tries = stubbed.state[: card.TRIES + card.SECTOR]  # what GRUB itself writes
         sectors = [offset // card.SECTOR for offset in unreadable]
-        super().__init__(board, self._disk, directory, unreadable=sectors)
+        super().__init__(board, self._disk, directory, unreadable=sectors, first=first)
 
     def start(self, state: State) -> Started:
         """Reset the computer with the card in this state, and wait for what comes of it."""

@@ -38,10 +38,12 @@ class StubComputer:
         unreadable: Iterable[int] = (),
         log_writes: Path | None = None,
         extra: tuple[str, ...] = (),
+        first: Path | None = None,
     ) -> None:
         """`disk`: file with the card's content; `unreadable`: sectors that fail when read.
 
-        `log_writes`: log of what the computer writes; `extra`: further arguments of QEMU.
+        `log_writes`: log of what the computer writes; `extra`: further arguments of QEMU; `first`: a file with the
+        content of another disk, from which the firmware boots if it can.
         """
         self._disk = disk
         blockdev = _blockdev(disk, unreadable, log_writes)
@@ -54,6 +56,10 @@ class StubComputer:
         def argv(qmp: str) -> list[str]:
             words = qemu.command_line(board, disk, options)
             words[words.index("-blockdev") + 1] = json.dumps(blockdev)
+            if first:
+                words = [word.replace("bootindex=0", "bootindex=1") for word in words]
+                words += ["-drive", f"if=none,id=first,format=raw,snapshot=on,file={first}"]
+                words += ["-device", "ide-hd,drive=first,bootindex=0"]
             return [*words, "-chardev", qemu.chardev("qmp", qmp), "-mon", "chardev=qmp,mode=control"]
 
         with theirs:
@@ -96,14 +102,19 @@ def slot_of(arguments: str | None) -> str | None:
 
 def assemble_stub(directory: Path, *, release: bool) -> bytes:
     """The kernel; `release`: one that also says which release it is, which `lab/power_cuts/releases.py` fills in."""
-    kernel, linked = directory / "stub_kernel", directory / "stub_kernel.o"
-    source = Path(__file__).with_name("stub_kernel.S")
+    return assemble("stub_kernel", directory, *(["--defsym", "RELEASE=1"] if release else []))
+
+
+def assemble(name: str, directory: Path, *options: str) -> bytes:
+    """The bytes of a program of this directory. `directory`: for files of its own."""
+    linked, program = directory / f"{name}.o", directory / name
+    source = Path(__file__).with_name(f"{name}.S")
     for argv in (
-        ["as", "--32", *(["--defsym", "RELEASE=1"] if release else []), "-o", str(linked), str(source)],
-        ["objcopy", "-O", "binary", "-j", ".text", str(linked), str(kernel)],
+        ["as", "--32", *options, "-o", str(linked), str(source)],
+        ["objcopy", "-O", "binary", "-j", ".text", str(linked), str(program)],
     ):
         subprocess.run(argv, check=True, capture_output=True, text=True)
-    return kernel.read_bytes()
+    return program.read_bytes()
 
 
 def _blockdev(disk: Path, unreadable: Iterable[int], log_writes: Path | None) -> dict[str, object]:

@@ -24,7 +24,7 @@ from flotilla.fleet import release_keys
 from flotilla.fleet.model import Board, Releases
 from flotilla.robot import release
 from flotilla.updates import delta, multicast
-from images.builder import bundle, card, environment_block, runtime, slot
+from images.builder import bundle, card, environment_block, runtime
 from lab.latency import computable_keys, machine, results, subject
 from lab.latency.virtual_loop import CHAIN, PLUGIN
 
@@ -102,7 +102,7 @@ def update(board: Board, directory: Path) -> Update:
         0: partition_table(), card.STATE.start: card.tries_block(),
         **{card.STATE.start + copy: card.state_copy() for copy in card.COPIES},
         a.start: (directory / "1/slot.img").read_bytes(),
-        a.end - card.HEADER_ROOM: environment_block.make(headers[1], slot.HEADER_BYTES),
+        a.end - card.HEADER_ROOM: environment_block.make(headers[1], card.HEADER_BYTES),
     }  # fmt: skip
     files = {f"{DIRECTORY}/card/{at}": piece for at, piece in pieces.items()}
     own = {

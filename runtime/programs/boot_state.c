@@ -283,6 +283,7 @@ bool boot_repair_tries(struct boot_card *card, char *reason, int size)
 
 bool boot_clear(struct boot_card *card, int slot, char *reason, int size)
 {
-    static const char nothing[BOOT_HEADER];
+    char nothing[BOOT_HEADER] ALIGNED;
+    fill_block(nothing, sizeof nothing, ""); /* a block, so that the boot loader reports no error */
     return write_sectors(card, header_place(card, slot), nothing, BOOT_HEADER, reason, size);
 }

@@ -11,6 +11,7 @@ import pytest
 from flotilla.fleet.model import Fleet
 from images.builder import card, environment_block, tools
 from images.builder.lock import read_lock
+from images.builder.manifest import Manifest
 from images.builder.tools import Tools
 from lab.qemu import qemu
 from tests.boot.guests import PENTIUM, SECONDS, boot_state, has_its_identity, nothing_failed, sh, tries, until
@@ -71,9 +72,9 @@ def test_damaged_slot_falls_back_and_a_hang_ends(fresh_guest: GuestFactory, tmp_
     robot.wait_booted()
     sh(robot, "systemctl is-system-running --wait", check=False)
     words = sh(robot, "cat /proc/cmdline").split()
-    assert {"flotilla.slot=B", f"root=PARTUUID={card.SLOTS[1].partuuid(robot.board)}"} <= set(words), (
-        f"booted {' '.join(words)}"
-    )
+    described = Manifest.model_validate_json(robot.image.with_suffix(".manifest.json").read_bytes())
+    (uuid,) = (each.partuuid for each in described.partitions if each.name == "B")
+    assert {"flotilla.slot=B", f"root=PARTUUID={uuid}"} <= set(words), f"booted {' '.join(words)}"
     assert re.search(r"sd.3$", sh(robot, "findmnt -n -o SOURCE /"))
     state = boot_state(robot)
     assert {name: state["slots"][name]["ok"] for name in "AB"} == {"A": False, "B": True}

@@ -16,7 +16,7 @@ import pytest
 
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
-from images.builder import build, card, environment_block, slot
+from images.builder import build, card, environment_block
 from lab.qemu import qemu
 from lab.qemu.guest import Guest
 from tests.figures import PROPERTY
@@ -50,11 +50,11 @@ def card_with(fleet: Fleet, bad: Content, to: Path) -> Path:
     a, b = card.SLOTS
     with to.open("r+b") as file:
         file.seek(a.end - card.HEADER_ROOM)
-        present = environment_block.values(file.read(slot.HEADER_BYTES))
+        present = environment_block.values(file.read(card.HEADER_BYTES))
         words = [word for word in present["ARGUMENTS"].split() if word != "quiet"]
         for place, header in ((a, present | {"ARGUMENTS": " ".join(words)}), (b, bad.header)):
             file.seek(place.end - card.HEADER_ROOM)
-            file.write(environment_block.make(header, slot.HEADER_BYTES))
+            file.write(environment_block.make(header, card.HEADER_BYTES))
         file.seek(b.start)
         file.write((bad.directory / "slot.img").read_bytes())
         for copy in card.COPIES:

@@ -21,6 +21,7 @@ from images.builder.lock import read_lock
 from images.builder.tools import Tools
 from lab.qemu import qemu
 from lab.qemu.boot_loader import BootLoader, Started, State, StubCard, header_place, initrd_place, kernel_place
+from lab.qemu.stub_computer import assemble
 
 ROBOT = 3
 UEFI_ROBOT = 2
@@ -34,8 +35,6 @@ CLEARED = "\x1b[1;1H"
 A, B = card.SLOTS
 TRIES = card.STATE.start + card.TRIES
 COPIES = [card.STATE.start + place for place in card.COPIES]
-
-PC104 = inventory.load_fleet().board()
 
 TRUSTING = b"""\
 serial --unit=0 --speed=115200
@@ -52,7 +51,7 @@ boot
 echo "slot $chosen does not boot"
 sleep 5
 reboot
-""".replace(b"OF_A", A.partuuid(PC104).encode()).replace(b"OF_B", B.partuuid(PC104).encode())
+"""
 """A configuration that believes the first copy: what the checks below must refuse."""
 
 
@@ -161,10 +160,18 @@ def check(loader: BootLoader, name: str, state: State) -> Started:
     started = loader.start(state)
     assert started.slot in ("A", "B"), f"{name}: no slot was started:\n{started.said}"
     slot = next(each for each in card.SLOTS if each.name == started.slot)
-    assert f"root=PARTUUID={slot.partuuid(loader.board)} quiet a=b " in started.arguments, (
+    assert f"root=PARTUUID={slot.partuuid(loader.board, loader.disk_id)} quiet a=b " in started.arguments, (
         f"{name}: {started.arguments}"
     )
     return started
+
+
+def test_a_new_card_boots_without_an_error(loader: BootLoader, fleet: Fleet) -> None:
+    """Seen to fail: `error: invalid environment block.`, of the slot that is empty."""
+    with image_of(inventory.robot(fleet, ROBOT)).open("rb") as image:
+        image.seek(header_place(B))
+        empty = image.read(card.HEADER_BYTES)
+    assert "error" not in check(loader, "as made", {header_place(B): empty}).said
 
 
 @pytest.mark.parametrize(
@@ -191,6 +198,35 @@ def test_every_state_leads_to_its_slot_with_uefi(fleet: Fleet, tmp_path: Path) -
     with BootLoader(fleet.boards[robot.board], stubbed, tmp_path / "uefi") as loader:
         for state in _STATES[::41]:
             _check_state(loader, *state)
+
+
+@pytest.mark.parametrize("other", [1, 4])
+def test_a_card_is_started_from_any_drive_beside_another(
+    fleet: Fleet, board: Board, stubbed: StubCard, tmp_path: Path, other: int
+) -> None:
+    """The first drive is another robot's card, from which something starts the second drive. Seen to fail: the boot
+    loader looked for the slots on the first drive, and both cards had the same identifier, so the kernel took the root
+    of either."""
+    another = StubCard(image_of(fleet.robots[other]), tmp_path / "another")
+    assert fleet.robots[other].board == board.name
+    assert another.disk_id != stubbed.disk_id
+    first = tmp_path / "first"
+    code = assemble("next_drive", tmp_path)
+    another.write(first, code.ljust(440, b"\0") + another.head[440:])
+    with BootLoader(board, stubbed, tmp_path / "second", first=first) as loader:
+        started = check(loader, "second drive", {})
+        assert f"BOOT_IMAGE=(hd1,msdos{A.number})" in started.arguments, started.said
+
+
+def test_a_card_is_started_beside_another_with_uefi(fleet: Fleet, toolset: Tools, tmp_path: Path) -> None:
+    """With its own root. The firmware finds nothing to start on the other one, which has another identifier."""
+    robot = inventory.robot(fleet, UEFI_ROBOT)
+    stubbed = StubCard(image_of(robot), tmp_path / "stub")
+    first = tmp_path / "first"
+    stubbed.write(first, stubbed.head[: card.SYSTEM.start].ljust(len(stubbed.head), b"\0"))
+    card.identify(fleet.boards[robot.board], toolset, first, 0xF1)
+    with BootLoader(fleet.boards[robot.board], stubbed, tmp_path / "second", first=first) as loader:
+        check(loader, "second drive", {})
 
 
 def _check_state(loader: BootLoader, order: str, good: str, trial: str, a: int, b: int) -> None:
@@ -344,8 +380,10 @@ def test_the_watchdog_runs_before_the_kernel_does(
 def test_a_configuration_that_believes_the_state_is_refused(
     board: Board, stubbed: StubCard, toolset: Tools, tmp_path: Path
 ) -> None:
-    sectors = str(len(stubbed.stub) // card.SECTOR).encode()
-    head = stubbed.with_core(card.grub_core(board, toolset, tmp_path, TRUSTING.replace(b"SECTORS", sectors)))
+    config = TRUSTING.replace(b"SECTORS", str(len(stubbed.stub) // card.SECTOR).encode())
+    for slot in card.SLOTS:
+        config = config.replace(f"OF_{slot.name}".encode(), slot.partuuid(board, stubbed.disk_id).encode())
+    head = stubbed.with_core(card.grub_core(board, toolset, tmp_path, config))
     with BootLoader(board, stubbed, tmp_path / "trusting", head=head) as trusting:
         assert check(trusting, "sound", copies(card.state_copy(2, order="B A", good="AB"))).slot == "B"
         for name, state in (

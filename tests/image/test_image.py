@@ -21,7 +21,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Board, Fleet, Robot
-from images.builder import card, environment_block, flash, manifest, slot, tools
+from images.builder import card, environment_block, flash, manifest, tools
 from images.builder.bmap import bmap_of, read_bmap
 from images.builder.build import image_of
 from images.builder.card import Partition
@@ -29,6 +29,8 @@ from images.builder.lock import read_lock
 from images.builder.tools import Tools
 
 MEBIBYTE = 1 << 20
+EMPTY = environment_block.make({}, card.HEADER_BYTES)
+"""The header of a slot that holds nothing."""
 ROOT_LIMIT = 110_000_000
 """Bytes of a compressed root; a slot holds more, but a card is also written and updates travel over a slow radio."""
 
@@ -179,18 +181,21 @@ def test_an_image_is_its_owners_alone(robot_card: Card) -> None:
     assert stat.S_IMODE(robot_card.image.stat().st_mode) == 0o600
 
 
-def test_partition_table_as_another_program_reads_it(robot_card: Card) -> None:
+def test_partition_table_as_another_program_reads_it(fleet: Fleet, robot_card: Card) -> None:
+    """Each card has its own identifier. Seen to fail: all had the same, so the root of two cards in a computer was
+    either's."""
+    own = str(identity.variables(fleet, robot_card.robot)["machine_id"])[:8]
     table = json.loads(robot_card.tools.run("usr/sbin/sfdisk", "--json", robot_card.image))["partitiontable"]
     found = table["partitions"]
     if robot_card.board.firmware == "uefi":
-        assert (table["label"], table["id"].lower()) == ("gpt", "464c4f54-0000-4000-8000-000000000000")
+        assert (table["label"], table["id"].lower()) == ("gpt", f"{own}-0000-4000-8000-000000000000")
         assert [one["name"] for one in found] == ["state", "A", "B", "data", "system"]
         assert [one["uuid"].lower() for one in found] == [
-            f"464c4f54-0000-4000-8000-{number:012}" for number in range(1, 6)
+            f"{own}-0000-4000-8000-{number:012}" for number in range(1, 6)
         ]
         assert "No errors detected" in robot_card.tools.run("usr/sbin/sfdisk", "--verify", robot_card.image)
     else:
-        assert (table["label"], table["id"]) == ("dos", f"0x{card.LAYOUT.disk_id:08x}")
+        assert (table["label"], table["id"]) == ("dos", f"0x{own}")
         bootable = [partition.get("bootable", False) for partition in found]
         assert bootable == [True, False, False, False], f"bootable flags: {bootable}"
     places = sorted((one["start"] * 512, one["size"] * 512) for one in found)
@@ -253,7 +258,7 @@ def test_flashed_over_garbage(robot_card: Card, tmp_path: Path) -> None:
             file.seek(card.SLOTS[1].start)
             assert file.read(4096) == b"\xff" * 4096, "slot B was written: this test no longer shows anything"
             file.seek(card.SLOTS[1].end - card.HEADER_ROOM)
-            assert file.read(slot.HEADER_BYTES) == bytes(slot.HEADER_BYTES), "slot B has the header of an earlier life"
+            assert file.read(card.HEADER_BYTES) == EMPTY, "slot B has the header of an earlier life"
             file.seek(card.STATE.start)
             state = file.read(card.STATE.size)
         assert _partition_table(target) == _partition_table(robot_card.image)
@@ -301,10 +306,12 @@ def test_second_slot_is_empty(robot_card: Card) -> None:
 # Shared and own
 
 
-def test_robots_of_a_board_share_all_but_the_data_partition() -> None:
+def test_robots_of_a_board_share_all_but_identifier_and_data_partition() -> None:
+    """The identifier lies in the MBR, or in the GPT and its copy."""
+    begin = 64 * card.SECTOR
     boards: dict[str, dict[str, str]] = {}
     for robot in _FLEET.robots.values():
-        boards.setdefault(robot.board, {})[robot.name] = _digest(_built(robot), 0, card.DATA.start)
+        boards.setdefault(robot.board, {})[robot.name] = _digest(_built(robot), begin, card.DATA.start - begin)
     for board, digests in boards.items():
         assert len(set(digests.values())) == 1, f"robots of {board} differ before the data partition: {digests}"
     first = {board: next(iter(digests.values())) for board, digests in boards.items()}
@@ -355,13 +362,13 @@ def _header(image: Path) -> dict[str, str]:
     """Of slot A."""
     with image.open("rb") as file:
         file.seek(card.SLOTS[0].end - card.HEADER_ROOM)
-        return environment_block.values(file.read(slot.HEADER_BYTES))
+        return environment_block.values(file.read(card.HEADER_BYTES))
 
 
 def test_kernel_command_line(robot_card: Card) -> None:
     words = _header(robot_card.image)["ARGUMENTS"].split()
     console = f"console={robot_card.board.console.tty},{robot_card.board.console.baud}n8"
-    expected = {*robot_card.board.kernel_arguments, "ro", "panic=10", console}
+    expected = {*robot_card.board.kernel_arguments, "ro", "panic=1", "sysctl.kernel.sysrq=0", console}
     assert expected <= set(words), f"slot A lacks {expected - set(words)}: {' '.join(words)}"
     assert words.index(console) > words.index("console=tty0"), "/dev/console must be the serial one, the last named"
     if robot_card.board.name == "smartcoret3":

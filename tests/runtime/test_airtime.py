@@ -27,7 +27,7 @@ from flotilla.common import paths
 from flotilla.fleet import inventory
 from flotilla.robot import release
 from flotilla.updates import multicast
-from images.builder import card, environment_block, slot
+from images.builder import card, environment_block
 from lab.containers import scale
 from lab.qemu.radio import Node, Radio
 from tests.airtime import Station
@@ -105,7 +105,7 @@ class Cell(Station):
         wanted.extract(self.directory / "wanted")
         with (self.robots[name] / "card").open("rb") as file:
             file.seek(card.SLOTS[1].end - card.HEADER_ROOM)
-            header = environment_block.values(file.read(slot.HEADER_BYTES))
+            header = environment_block.values(file.read(card.HEADER_BYTES))
             file.seek(card.SLOTS[1].start)
             content = file.read(int(wanted.header["BYTES"]))
         return header == wanted.header and content == (self.directory / "wanted").read_bytes()
@@ -173,7 +173,7 @@ def cell(tmp_path: Path, flotilla_slot: Path, monkeypatch: pytest.MonkeyPatch) -
                     (0, partition_table()), (card.STATE.start, card.tries_block()),
                     *((card.STATE.start + copy, card.state_copy()) for copy in card.COPIES),
                     (A.start, OLD), (A.start + A.size - (1 << 20), document),
-                    (A.end - card.HEADER_ROOM, environment_block.make(header, slot.HEADER_BYTES)),
+                    (A.end - card.HEADER_ROOM, environment_block.make(header, card.HEADER_BYTES)),
                 ):  # fmt: skip
                     file.seek(at)
                     file.write(content)

@@ -15,9 +15,11 @@ from typing import Any
 import pytest
 
 from flotilla.fleet import inventory
-from images.builder import card, environment_block, slot
+from images.builder import card, environment_block
 
 COPIES = [card.STATE.start + place for place in card.COPIES]
+EMPTY = environment_block.make({}, card.HEADER_BYTES)
+"""The header of a slot that holds nothing."""
 TRIES = card.STATE.start + card.TRIES
 PC = next(board for board in inventory.load_fleet().boards.values() if board.firmware == "uefi")
 
@@ -67,7 +69,7 @@ def new(tmp_path: Path, flotilla_slot: Path) -> Card:
         made.write(place, card.state_copy())
     for number, each in enumerate(card.SLOTS, 1):
         values = {"RELEASE": str(number), "FLOOR": "1", "BLOB": f"{number:064x}", "VERSION": "6.1.0-rt"}
-        made.write(each.end - card.HEADER_ROOM, environment_block.make(values, slot.HEADER_BYTES))
+        made.write(each.end - card.HEADER_ROOM, environment_block.make(values, card.HEADER_BYTES))
     return made
 
 
@@ -162,7 +164,7 @@ def test_what_is_refused_changes_nothing(new: Card) -> None:
         (("trial", "B"), "is empty"), (("trial", "C"), "usage"), (("begin",), "usage"),
     ):  # fmt: skip
         if why == "is empty":
-            new.write(card.SLOTS[1].end - card.HEADER_ROOM, bytes(slot.HEADER_BYTES))
+            new.write(card.SLOTS[1].end - card.HEADER_ROOM, EMPTY)
         done = new.run(*words)
         assert done.returncode in (1, 2)
         assert why in done.stderr, done.stderr
@@ -178,7 +180,7 @@ def test_a_cleared_slot_is_empty(new: Card) -> None:
         new.write(place, card.state_copy(4, order="B A", good="AB"))
     shown = new.do("clear", "B")
     assert (shown["order"], shown["slots"]["B"]["ok"], shown["slots"]["B"]["release"]) == (["A", "B"], False, None)
-    assert not any(new.read(card.SLOTS[1].end - card.HEADER_ROOM, slot.HEADER_BYTES))
+    assert new.read(card.SLOTS[1].end - card.HEADER_ROOM, card.HEADER_BYTES) == EMPTY
 
 
 def test_one_copy_is_enough_and_the_other_is_made_again(new: Card) -> None:

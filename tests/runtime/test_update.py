@@ -21,13 +21,15 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.robot import release
 from flotilla.updates import delta
-from images.builder import card, environment_block, slot
+from images.builder import card, environment_block
 from tests.runtime.test_slot import partition_table
 
 PROGRAM = paths.OVERLAY / "usr/lib/flotilla/update.py"
 CHUNK = 4096
 SEED = 18
 B = card.SLOTS[1]
+EMPTY = environment_block.make({}, card.HEADER_BYTES)
+"""The header of a slot that holds nothing."""
 
 
 def header_of(blob: bytes, **changed: str) -> dict[str, str]:
@@ -132,7 +134,7 @@ def robot(tmp_path: Path, keys: Path, flotilla_slot: Path, monkeypatch: pytest.M
             (0, partition_table()), (card.STATE.start, card.tries_block()),
             *((card.STATE.start + copy, card.state_copy()) for copy in card.COPIES),
             (card.SLOTS[0].start, present),
-            (card.SLOTS[0].end - card.HEADER_ROOM, environment_block.make(header_of(present), slot.HEADER_BYTES)),
+            (card.SLOTS[0].end - card.HEADER_ROOM, environment_block.make(header_of(present), card.HEADER_BYTES)),
         ):  # fmt: skip
             written.seek(place)
             written.write(content)
@@ -176,7 +178,7 @@ def test_a_release_is_taken_and_tried(robot: Robot) -> None:
     assert told["missing"] == list(range(10, 40)), "what the running release has in the same place is not sent"
     robot.take(text, "alice", "carol")
     assert robot.read(B.start, len(robot.blob)) == robot.blob
-    header = environment_block.values(robot.read(B.end - card.HEADER_ROOM, slot.HEADER_BYTES))
+    header = environment_block.values(robot.read(B.end - card.HEADER_ROOM, card.HEADER_BYTES))
     assert header == header_of(robot.blob, RELEASE="6")
     robot.run("activate")
     assert robot.module.slots()["trial"] == "B"
@@ -193,7 +195,7 @@ def test_what_was_cut_off_goes_on(robot: Robot) -> None:
         robot.run("write", frame + frame[:1000])
     told = robot.run("finish")
     assert (told["staged"], len(told["missing"])) == (False, 29)
-    assert not any(robot.read(B.end - card.HEADER_ROOM, slot.HEADER_BYTES))
+    assert not any(robot.read(B.end - card.HEADER_ROOM, card.HEADER_BYTES))
     with pytest.raises(robot.module.Refused, match="does not hold release"):
         robot.run("activate")
     with pytest.raises(robot.module.Refused, match="not what the release says"):
@@ -210,7 +212,7 @@ def test_a_new_release_empties_the_slot_first(robot: Robot) -> None:
     robot.begin(other, robot.sign(other, "alice", "bob"))
     assert robot.read(B.end - card.HEADER_ROOM, 8) == b"# GRUB E", "asking changes nothing"
     robot.run("copy")
-    assert not any(robot.read(B.end - card.HEADER_ROOM, slot.HEADER_BYTES))
+    assert robot.read(B.end - card.HEADER_ROOM, card.HEADER_BYTES) == EMPTY
 
 
 def test_a_delta_brings_the_rest(

@@ -112,7 +112,7 @@ def test_a_robot_sees_its_boards_ports_and_sets_files(tmp_path: Path) -> None:
     (root / "etc/sysctl.d/50.conf").write_text((paths.OVERLAY / "etc/sysctl.d/50-flotilla.conf").read_text())
     (root / "etc/sysctl.d/99.conf").write_text("# kernel.sysrq = 1\n-kernel.printk=3\n")
     files = container.own_files(root, inventory.load_fleet().boards["smartcoret3"])
-    assert files["proc/sys/kernel/panic"] == Path("/proc/sys/kernel/panic").read_text()
+    assert files["proc/sys/kernel/panic_on_oops"] == Path("/proc/sys/kernel/panic_on_oops").read_text()
     assert "proc/sys/kernel/printk" in files
     assert "proc/sys/kernel/sysrq" not in files
     assert files["proc/tty/driver/serial"].splitlines()[-1].startswith("11: uart:16550A ")

@@ -66,7 +66,11 @@ LOCK = Lock(
     (Suite("debian", "bookworm", datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)),),
     (locked("beta", "2:3-1", "b" * 64), locked("gamma", "1.2", "c" * 64), locked("libone", "1.2+b1", "a" * 64)),
 )
-NODES = [Node(PurePosixPath("/etc")), Node(PurePosixPath("/etc/hostname"), b"robot3\n", 0o644)]
+NODES = [
+    Node(PurePosixPath("/etc")),
+    Node(PurePosixPath("/etc/hostname"), b"robot3\n", 0o644),
+    Node(PurePosixPath("/etc/machine-id"), b"%032x\n" % (0xF1 << 96), 0o644),
+]
 
 
 @pytest.fixture(scope="module")
@@ -378,6 +382,7 @@ def written(
     locks = lock or read_lock("smartcoret3"), read_lock("tools")
     manifest.write(
         fleet, fleet.robots[number], locks, common, board_inputs="0", nodes=NODES, source=source, apps=(),
+        boot_loader=manifest.Part(name="boot loader", bytes=9, sha256="0"),
         data=manifest.Part(name="data partition", bytes=9, sha256="1"),
         image=manifest.Part(name=image.name, bytes=card.SIZE, sha256="2"), extents=EXTENTS, beside=image,
     )  # fmt: skip
@@ -391,7 +396,7 @@ def test_manifest(fleet: Fleet, tmp_path: Path) -> None:
     assert made.lock.sha256 == read_lock("smartcoret3").digest
     assert made.hostvars["interface"] == fleet.interface(fleet.robots[3])
     assert made.hostvars["address"] == str(fleet.robots[3].address)
-    assert [part.name for part in made.parts] == ["vmlinuz", "data partition"]
+    assert [part.name for part in made.parts] == ["boot loader", "vmlinuz", "data partition"]
     assert {partition.name: partition.used for partition in made.partitions} == {
         "state": 8192,
         "A": 5,

@@ -174,7 +174,7 @@ def test_its_card_boots_it(board: Board) -> None:
     assert [each for each in card.kernel_arguments(two) if each not in arguments] == isolation
     partitions = [card.STATE, *card.SLOTS, card.DATA]
     assert [one.end for one in partitions] == [*(one.start for one in partitions[1:]), card.SIZE]
-    assert [one.partuuid(board) for one in partitions] == [f"464c4f54-0{number}" for number in (1, 2, 3, 4)]
+    assert [one.partuuid(board, 0xF1) for one in partitions] == [f"000000f1-0{number}" for number in (1, 2, 3, 4)]
 
 
 def test_its_robot_gets_its_ports_and_modules(fleet: Fleet) -> None:
@@ -409,7 +409,7 @@ def test_the_other_locks(own: Path, fleet: Fleet, old: str, new: str, said: str)
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("disk_id: 0x464C4F54", "disk_id: 0", r"card\.yml:\d+: disk_id: 0: is out of range; 1 to 4294967295"),
+        ("data_mib: 32", "data_mib: 0", r"card\.yml:\d+: data_mib: 0: is out of range; 8 to 16384 MiB"),
         ("slot_mib: 176", "", r"card\.yml:\d+: slot_mib: \(missing\): is missing; add it"),
         ("layout: 2", "layout: '2'", r"card\.yml:\d+: layout: '2': is not a whole number; digits without"),
         ("data_mib", "date_mib", r"card\.yml:\d+: date_mib: 32: is not known; did you mean data_mib\?"),

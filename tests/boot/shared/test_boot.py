@@ -7,7 +7,8 @@ import shlex
 
 from flotilla.fleet.model import Board
 from images.builder import card
-from tests.boot.guests import boot_state, label, nothing_failed, sh, tries
+from images.builder.manifest import Manifest
+from tests.boot.guests import SECONDS, boot_state, label, nothing_failed, sh, tries
 from tests.boot.shared.conftest import Report
 from tests.conftest import RobotGuest
 
@@ -56,10 +57,21 @@ def test_boots_the_card_through_grub(robot: RobotGuest, board: Board) -> None:
 def test_kernel_command_line(robot: RobotGuest, board: Board) -> None:
     words = sh(robot, "cat /proc/cmdline").split()
     slot = card.SLOTS[0]
-    expected = [f"root=PARTUUID={slot.partuuid(board)}", *card.kernel_arguments(board), f"flotilla.slot={slot.name}"]
+    described = Manifest.model_validate_json(robot.image.with_suffix(".manifest.json").read_bytes())
+    (uuid,) = (each.partuuid for each in described.partitions if each.name == slot.name)
+    expected = [f"root=PARTUUID={uuid}", *card.kernel_arguments(board), f"flotilla.slot={slot.name}"]
     table = {"bios": "msdos", "uefi": "gpt"}[board.firmware]
     assert words[0].startswith(f"BOOT_IMAGE=(hd0,{table}{slot.number})")
     assert words[1:] == expected
+
+
+def test_a_break_on_the_console_is_no_command(robot: RobotGuest) -> None:
+    """Seen to fail: BREAK and `b` restarted the robot."""
+    before = sh(robot, "cat /proc/sys/kernel/random/boot_id")
+    robot.machine.execute("chardev-send-break", id="console")
+    robot.machine.console.send("bbb-no-login")
+    robot.machine.console.expect("bb-no-login", SECONDS)
+    assert sh(robot, "cat /proc/sys/kernel/random/boot_id") == before
 
 
 def test_kernel_is_real_time(robot: RobotGuest) -> None:
