@@ -120,7 +120,7 @@ def _make(subject: app.App, description: app.Make, system: System, out: Path, ru
         variables = ["CC=gcc", "AR=ar", "PKG_CONFIG=pkg-config", f"CFLAGS={flags}"]
         variables += ["LDFLAGS=-Wl,--build-id=none"]
         runtime.command(Path(directory), system, ["env", "-C", "/out/source", *variables, "make"], run)
-        if not made.is_file():
+        if not (made.is_file() and sources.inside(source, made)):
             where = paths.shown(subject.directory / app.FILE)
             raise UserError(f"{where}: program: {description.program}: make does not make it; name what it makes")
         program = out / made.name
@@ -141,7 +141,7 @@ def _send_along(subject: app.App, description: app.Make, source: Path, out: Path
             raise UserError(f"{where}: files: {name}: is not there, and make does not make it; name what there is")
         if taken.exists():
             raise UserError(f"{where}: files: {name}: is sent anyhow; leave it out, or give it another name")
-        if any(path.is_symlink() and not path.resolve().is_relative_to(source.resolve()) for path in _below(sent)):
+        if not all(sources.inside(source, path) for path in _below(sent)):
             raise UserError(f"{where}: files: {name}: has a link to outside the app; put a copy in its place")
         taken.parent.mkdir(parents=True, exist_ok=True)
         if sent.is_dir():

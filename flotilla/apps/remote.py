@@ -18,10 +18,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Annotated, Any, BinaryIO
+
+import pydantic
 
 from flotilla.apps import app, fmu
-from flotilla.common import durable, namespace, paths, progress
+from flotilla.common import durable, namespace, paths, progress, text
 from flotilla.common.errors import UserError
 from flotilla.common.processes import DIE_WITH_PARENT
 from flotilla.fleet import apps
@@ -32,6 +34,14 @@ Show = Callable[[str], None]
 """Takes a line of the app's log."""
 SCRIPT = Path(__file__).with_suffix(".sh")
 """What runs on robots, as root."""
+_ANSWER_BYTES = 64 << 20
+"""Of what a robot answers to a command. A journal is the longest."""
+MADE_BYTES = 1 << 30
+"""Of what it compiled."""
+_LINE = 1 << 16
+"""Characters of a line that a robot writes; a longer one is taken apart."""
+_ENTRY = 1 << 20
+"""Of an entry of its journal, which has 48 KiB of text at most."""
 _RESERVE_KIB = 4096
 """Of the data partition, for the robot's journal and an app's statistics."""
 
@@ -54,26 +64,33 @@ class Connection:
 
     def run(self, command: str, name: str, *arguments: str, stdin: bytes = b"") -> str:
         """Run it; what it says. UserError with the reason when it refuses or the robot does not answer."""
-        with _started(self.argv(command, name, *arguments)) as process:
-            try:
-                output, failure = process.communicate(stdin)
-            except BaseException:
-                process.kill()
-                raise
-        if process.returncode:
-            raise self.error(process.returncode, failure.decode(errors="replace"))
-        return output.decode(errors="replace")
+        with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as failure:
+            argv = [*_limited(_ANSWER_BYTES), *self.argv(command, name, *arguments)]
+            with _started(argv, output, failure) as process:
+                try:
+                    process.communicate(stdin)
+                except BaseException:
+                    process.kill()
+                    raise
+            if process.returncode:
+                raise self.error(process.returncode, _content(failure))
+            return _content(output)
 
     def stream(self, command: str, name: str, *arguments: str, stdin: Path, stdout: Path, log: Path) -> None:
         """Run it between two files; what it says besides is shown as it comes, and kept in `log`."""
-        argv = [*DIE_WITH_PARENT, *self.argv(command, name, *arguments)]
+        argv = [*DIE_WITH_PARENT, *_limited(MADE_BYTES), *self.argv(command, name, *arguments)]
         last = failed = ""
+        left = _ANSWER_BYTES
         with stdin.open("rb") as given, stdout.open("wb") as made, log.open("w") as kept:
             pipe = subprocess.PIPE
             with subprocess.Popen(argv, stdin=given, stdout=made, stderr=pipe, text=True, errors="replace") as process:
                 assert process.stderr
                 try:
-                    for last in process.stderr:
+                    for last in _lines(process.stderr):
+                        left -= len(last)
+                        if left < 0:
+                            raise UserError(f"{self.robot.name}: says more than {_ANSWER_BYTES >> 20} MiB; look there")
+                        last = text.shown(last)
                         kept.write(last)
                         print(last, end="", file=sys.stderr, flush=True)
                         failed = failed or (last if namespace.ERROR.search(last) else "")
@@ -88,6 +105,8 @@ class Connection:
     def error(self, status: int, message: str) -> UserError:
         """Why something failed on the robot, or on the way."""
         name, message = self.robot.name, message.strip()
+        if status == -signal.SIGXFSZ:
+            return UserError(f"{name}: its answer does not end; nothing was done with it: look at the robot")
         if status != 255:
             return UserError(f"{name}: {message or f'status {status}'}")
         if "Host key verification failed" in message or "IDENTIFICATION HAS CHANGED" in message:
@@ -99,13 +118,27 @@ class Connection:
         return ssh.no_answer(self.robot, message or "the connection broke")
 
 
-def _started(argv: Sequence[str]) -> subprocess.Popen[bytes]:
-    """A process with pipes. Ctrl-C meanwhile leaves none behind, which would hold its end of the robot's command."""
+def _limited(most: int) -> list[str]:
+    """Prefix of a command that ends when it has written so much into a file."""
+    return ["prlimit", f"--fsize={most}", "--"]
+
+
+def _lines(stream: IO[str]) -> Iterator[str]:
+    return iter(lambda: stream.readline(_LINE), "")
+
+
+def _content(file: BinaryIO) -> str:
+    file.seek(0)
+    return file.read().decode(errors="replace")
+
+
+def _started(argv: Sequence[str], output: BinaryIO, failure: BinaryIO) -> subprocess.Popen[bytes]:
+    """A process that writes to files. Ctrl-C meanwhile leaves none behind, which would hold its end of the robot's
+    command."""
     interrupts: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
-    pipe = subprocess.PIPE
     try:
-        process = subprocess.Popen(argv, stdin=pipe, stdout=pipe, stderr=pipe)
+        process = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=output, stderr=failure)
     finally:
         signal.signal(signal.SIGINT, before)
     if interrupts:
@@ -168,7 +201,7 @@ def remove(to: Connection, name: str) -> None:
 
 def status(to: Connection, name: str) -> str:
     """Whether it runs, since when, and whether it starts with the robot; a line each."""
-    return to.run("status", name).strip()
+    return text.shown(to.run("status", name).strip())
 
 
 class _Interrupts:
@@ -206,14 +239,14 @@ def run(to: Connection, name: str, show: Show) -> str:
     # In a session of its own: Ctrl-C ends the app and not the log, whose last lines say what came of it.
     argv = [*DIE_WITH_PARENT, *to.argv("run", name)]
     log: list[str] = []
-    ended: dict[str, Any] = {}
+    ended: _Entry | None = None
     cursor = ""
 
     def take(line: str) -> None:
         nonlocal ended, cursor
-        entry: dict[str, Any] = json.loads(line)
-        cursor = entry["__CURSOR"]
-        if entry.get("MESSAGE_ID") in _ENDED:
+        entry = _entry(to, line)
+        cursor = entry.cursor
+        if entry.id in _ENDED:
             ended = entry
         log.append(_message(entry))
         show(log[-1])
@@ -227,8 +260,8 @@ def run(to: Connection, name: str, show: Show) -> str:
         assert process.stderr
         try:
             interrupts.end(process)
-            cursor = process.stdout.readline().strip()
-            while not ended and (line := process.stdout.readline()).endswith("\n"):
+            cursor = process.stdout.readline(_LINE).strip()
+            while not ended and (line := process.stdout.readline(_ENTRY)).endswith("\n"):
                 try:
                     take(line)
                 except KeyboardInterrupt:
@@ -236,7 +269,7 @@ def run(to: Connection, name: str, show: Show) -> str:
                         raise
                     interrupts.end()
             if not ended and not interrupts.any:
-                raise to.error(process.wait(), process.stderr.read())
+                raise to.error(process.wait(), process.stderr.read(_LINE))
         except KeyboardInterrupt:
             to.run("stop", name)
             raise
@@ -246,10 +279,9 @@ def run(to: Connection, name: str, show: Show) -> str:
         take(line)
     _write(to, name, "log", "".join(f"{line}\n" for line in log))
     outcome = report(to, name)
-    if ended and _ENDED[ended["MESSAGE_ID"]] != "success":
-        result = ended.get("UNIT_RESULT", "it failed")
+    if ended and _ENDED[ended.id or ""] != "success":
         remedy = f"its log is {paths.shown(_file(to, name, 'log'))}"
-        raise UserError("\n".join(filter(None, (outcome, f"{to.robot.name}: {name} ended: {result}; {remedy}"))))
+        raise UserError("\n".join(filter(None, (outcome, f"{to.robot.name}: {name} ended: {ended.result}; {remedy}"))))
     return outcome
 
 
@@ -264,30 +296,54 @@ def interrupted(to: Connection, name: str) -> str:
     return f"{to.robot.name}: {name} is {state}, version {version}, and {kept} with the robot"
 
 
-def _message(entry: dict[str, Any]) -> str:
-    """The text of a journal's entry in JSON, where bytes that are no text come as a list of numbers."""
-    message = entry.get("MESSAGE")
-    return bytes(message).decode(errors="replace") if isinstance(message, list) else message or ""
+class _Entry(pydantic.BaseModel):
+    """Of a journal in JSON, where bytes that are no text come as a list of numbers."""
+
+    model_config = pydantic.ConfigDict(strict=True)
+    cursor: str = pydantic.Field(alias="__CURSOR", max_length=1000)
+    message: str | list[Annotated[int, pydantic.Field(ge=0, le=255)]] | None = pydantic.Field(None, alias="MESSAGE")
+    id: str | None = pydantic.Field(None, alias="MESSAGE_ID")
+    result: str = pydantic.Field("it failed", alias="UNIT_RESULT")
+
+
+def _entry(to: Connection, line: str) -> _Entry:
+    try:
+        return _Entry.model_validate_json(line)
+    except pydantic.ValidationError:
+        raise UserError(f"{to.robot.name}: its log has what is no entry of a journal: {line[:100]!a}") from None
+
+
+def _message(entry: _Entry) -> str:
+    """The entry's text, fit for a terminal."""
+    message = entry.message
+    return text.shown(bytes(message).decode(errors="replace") if isinstance(message, list) else message or "")
 
 
 def follow_log(to: Connection, name: str) -> None:
     """Its last lines and all that come, on standard output, until KeyboardInterrupt."""
     sys.stdout.flush()
     with suppress(KeyboardInterrupt):
-        done = subprocess.run([*DIE_WITH_PARENT, *to.argv("log", name)], check=False)
-        if done.returncode:
-            raise to.error(done.returncode, "what it says is above")
+        argv = [*DIE_WITH_PARENT, *to.argv("log", name)]
+        with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, errors="replace") as process:
+            assert process.stdout
+            try:
+                for line in _lines(process.stdout):
+                    print(text.shown(line), end="", flush=True)
+            finally:
+                process.terminate()
+        if process.returncode:
+            raise to.error(process.returncode, "what it says is above")
 
 
 def report(to: Connection, name: str) -> str:
     """What it measured when it ended; empty when it wrote nothing. The file is brought along."""
-    text = to.run("statistics", name)
-    if not text:
+    statistics = to.run("statistics", name)
+    if not statistics:
         return ""
-    _write(to, name, "json", text)
+    _write(to, name, "json", statistics)
     try:
-        lines = summary(json.loads(text))
-    except (ValueError, KeyError, TypeError):
+        lines = [text.shown(line) for line in summary(json.loads(statistics))]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         lines = ["its statistics are not those of flotilla-run"]
     return "\n".join([*lines, f"all of it: {paths.shown(_file(to, name, 'json'))}"])
 

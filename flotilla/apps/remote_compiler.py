@@ -15,6 +15,7 @@ from pathlib import Path
 
 from flotilla.apps import remote
 from flotilla.common import cache, paths, progress
+from flotilla.common.errors import UserError
 from images.builder import pool, tools
 from images.builder.chroot import Chroot
 from images.builder.lock import Lock, read_lock
@@ -63,8 +64,14 @@ class Compiler:
             need_kib = 2 * sent.stat().st_size // 1024 + _RESERVE_KIB
             with progress.step(f"{self._name} compiled on {self._to.robot.name}"):
                 self._to.stream("compile", self._name, digest, str(need_kib), *argv, stdin=sent, stdout=made, log=log)
-            # tar, which keeps what it unpacks inside: the other end may be anybody's by now.
-            subprocess.run(["tar", "-x", "--no-same-owner", "-f", made, "-C", work], check=True)
+            # tar, which keeps what it unpacks inside: the other end may be anybody's by now. Whoever reads what was
+            # made follows no link that leads out of `work`: images.builder.runtime.command refuses these.
+            unpack = ["tar", "-x", "--no-same-owner", "--no-same-permissions", "-f", str(made), "-C", str(work)]
+            done = subprocess.run(
+                ["prlimit", f"--fsize={remote.MADE_BYTES}", "--", *unpack], capture_output=True, text=True, check=False
+            )
+        if done.returncode:
+            raise UserError(f"{self._to.robot.name}: what it compiled is no archive: {done.stderr.strip()[:500]}")
 
     def _bring(self, image: Path) -> str:
         """Its hash; the robot has it now."""

@@ -12,6 +12,7 @@ from itertools import groupby
 from flotilla.cli.command import Command
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.common.text import shown
 
 GROUP = "flotilla.commands"
 """Entry points, each a tuple of `Command`, in pyproject.toml: so the lab has commands, and nothing here knows it."""
@@ -67,7 +68,7 @@ def main() -> int:
         paths.check()
         next(command for command in known if command.name == arguments.command).run(arguments)
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shown(str(error))}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
         group = next(command.packages for command in known if command.name == word)
@@ -80,6 +81,6 @@ def main() -> int:
         )
         return 1
     except KeyboardInterrupt as interrupt:
-        print(f"error: interrupted; {str(interrupt) or 'the last good outputs are untouched'}", file=sys.stderr)
+        print(f"error: interrupted; {shown(str(interrupt)) or 'the last good outputs are untouched'}", file=sys.stderr)
         return 130
     return 0

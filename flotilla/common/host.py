@@ -14,6 +14,7 @@ from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 
 _COMMANDS = {
+    "bwrap": "bubblewrap",
     "chroot": "coreutils",
     "dpkg-deb": "dpkg",
     "git": "git",

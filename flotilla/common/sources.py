@@ -7,6 +7,7 @@ the files of their users enters nowhere, and an empty directory neither: git kee
 from __future__ import annotations
 
 import fnmatch
+import os
 import stat
 from collections.abc import Iterable
 from pathlib import Path
@@ -47,6 +48,24 @@ def files(directory: Path) -> list[Path]:
         else:
             raise UserError(f"{paths.shown(path)}: is neither a file nor a link nor a directory; remove it")
     return found
+
+
+def strays(directory: Path) -> dict[Path, str]:
+    """What nobody may read who wants the files of a directory: links that lead out of it, with where they lead, and
+    what is neither a file nor a link nor a directory."""
+    root, found = os.path.realpath(directory), {}
+    for path in directory.rglob("*"):
+        mode = path.lstat().st_mode
+        if stat.S_ISLNK(mode) and Path(root) not in [where := Path(os.path.realpath(path)), *where.parents]:
+            found[path] = f"leads out of {paths.shown(directory)}"
+        elif not (stat.S_ISLNK(mode) or stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            found[path] = "is neither a file nor a link nor a directory"
+    return found
+
+
+def inside(directory: Path, path: Path) -> bool:
+    """Whether a path, after all links on its way, is in the directory."""
+    return path.resolve().is_relative_to(directory.resolve())
 
 
 def executable(path: Path) -> bool:

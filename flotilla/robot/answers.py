@@ -7,19 +7,17 @@ in a form that can be displayed: text without control characters, finite numbers
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 
 from flotilla.common.errors import UserError
+from flotilla.common.text import shown
 
 _DEPTH = 16
 _TEXT = 1 << 17
 """Characters of a text: what `library/robot_state.py` shows of a file is half of that at most."""
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
-"""Characters that control a terminal or change the direction of text; not tabs and line ends."""
 
 Text = Annotated[str, pydantic.StringConstraints(max_length=_TEXT)]
 Word = Annotated[str, pydantic.StringConstraints(pattern=r"^[A-Za-z0-9_.@:/+-]{1,256}$")]
@@ -158,11 +156,6 @@ def outcome(answer: Mapping[str, object]) -> dict[str, Any]:
     if found.get("failed") or found.get("unreachable"):
         found["msg"] = shown(": ".join(said))[:_TEXT]
     return found
-
-
-def shown(text: str) -> str:
-    """A text in which control characters are seen, not heeded."""
-    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def _tidy(value: object, depth: int) -> object:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flotilla.common import cache, namespace, paths, progress, sources, together
+from flotilla.common import cache, namespace, paths, progress, sandbox, sources, together
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import System
 from images.builder import chroot, pool, runtime_stage, toolchain, tools
@@ -28,6 +28,11 @@ WARNINGS = ("-Wall", "-Wextra", "-Werror")
 _KIND = "runtime"
 """Of results in the cache."""
 MADE_BY = (runtime_stage.__file__, chroot.__file__, namespace.__file__)
+_CHECK_SECONDS = 60
+_CHECK_BYTES = 1 << 20
+"""Of what it writes about plug-ins and tasks."""
+_BY_SIGNAL = 128
+"""What bubblewrap adds to the signal that ended a program."""
 _LEFT_OUT = ("bench", "tests", "tidy.py")
 """Folders of the source that no package comes from."""
 
@@ -60,11 +65,21 @@ def command(work: Path, system: System, argv: Sequence[str], run: toolchain.Run 
     """Run a command among the locked compiler and libraries of an architecture; errors are its own words.
 
     There, `work` is /out, and gets the public headers in /out/include. `run` says where that is; so does it below.
+    It runs what others wrote: UserError where it leaves a link that leads elsewhere, or a pipe.
     """
     copy_sources(work, "include")
+    before = _strays(work)
     log = paths.BUILD / f"compile-{system.suite}-{system.architecture}.log"
     with cache.locked(log.with_name(f".{log.name}.lock")):  # an error shows what the log ends with
         run(runtime_lock(system), work, argv, log)
+    for path, what in _strays(work).items() - before.items():
+        raise UserError(f"{path.relative_to(work)}: {what}: it was not there before the build; nothing of that is read")
+
+
+def _strays(work: Path) -> dict[Path, str]:
+    """Those of sources.strays, with where links lead."""
+    found = sources.strays(work)
+    return {path: f"{why} ({path.readlink()})" if path.is_symlink() else why for path, why in found.items()}
 
 
 def compile_plugin(
@@ -119,7 +134,10 @@ def compile_shared(
             objects = [f"{Path(name).stem}.o" for name in others]
         link = ["-shared", "-s", "-Wl,--build-id=none", *options, "-o", "/out/plugin.so"]
         command(work, system, [*gcc, *link, *files, *objects, "-lm"], run)
-        return (work / "plugin.so").read_bytes()
+        made = work / "plugin.so"
+        if made.is_symlink() or not made.is_file():
+            raise UserError(f"{made.name}: the compiler was to make this file and did not")
+        return made.read_bytes()
 
 
 def check_plugins(directory: Path, system: System) -> list[dict[str, Any]]:
@@ -127,10 +145,13 @@ def check_plugins(directory: Path, system: System) -> list[dict[str, Any]]:
 
     It runs on this computer as a robot of the plug-ins' `system` has it; so does it below.
     """
-    done = _run(system, "flotilla-blocks", "--blocks", str(directory), "--json")
+    done = _run(system, [directory], "flotilla-blocks", "--blocks", str(directory), "--json")
     if done.returncode:
-        raise UserError(_said(done).replace(f"{directory}/", ""))
-    listing: list[dict[str, Any]] = json.loads(done.stdout)
+        raise UserError(_said("flotilla-blocks", done).replace(f"{directory}/", ""))
+    try:
+        listing: list[dict[str, Any]] = json.loads(done.stdout)
+    except ValueError as error:  # a plug-in may write there, too
+        raise UserError(f"the list of blocks is not JSON: {error}; plug-ins must not write to standard output") from None
     return listing
 
 
@@ -143,16 +164,19 @@ def check_task(path: Path, content: bytes, plugins: Path | None = None, system: 
         file = Path(directory) / path.name
         file.write_bytes(content)
         directories = ":".join(str(each) for each in (plugins, _programs(system) / "usr/lib/flotilla/blocks") if each)
-        done = _run(system, "flotilla-run", "--check", "--blocks", directories, str(file))
+        needed = [file, *([plugins] if plugins else [])]
+        done = _run(system, needed, "flotilla-run", "--check", "--blocks", directories, str(file))
         if done.returncode:
-            raise UserError(_said(done).replace(str(file), paths.shown(path)))
+            raise UserError(_said("flotilla-run", done).replace(str(file), paths.shown(path)))
 
 
-def _said(done: subprocess.CompletedProcess[str]) -> str:
-    """Why it failed. Of a crash it does not say so itself."""
-    if done.returncode >= 0:
+def _said(program: str, done: subprocess.CompletedProcess[str]) -> str:
+    """Why it failed. Of a crash it does not say so itself, and a code of a block may say anything."""
+    if refused := sandbox.refusal(done.stderr):
+        raise refused
+    if done.returncode <= _BY_SIGNAL:
         return done.stderr.strip()
-    crashed = f"{Path(done.args[0]).name} was ended by {signal.Signals(-done.returncode).name}"
+    crashed = f"{program} was ended by {signal.Signals(done.returncode - _BY_SIGNAL).name}"
     return f"{crashed}: code of a block crashes when it is loaded or configured\n{done.stderr}".strip()
 
 
@@ -166,11 +190,20 @@ def _programs(system: System) -> Path:
     return cache.result("runtime-programs", made.directory.name.removeprefix("runtime-"), unpack)
 
 
-def _run(system: System, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a program of the runtime on this computer, whatever libraries that has."""
-    tree = tools.tree(read_lock(runtime_lock(system)))
-    argv = tools.command(tree, _programs(system) / "usr/bin" / program, system.architecture)
-    return subprocess.run([*argv, *arguments], capture_output=True, encoding="utf-8", check=False)
+def _run(system: System, needed: Sequence[Path], program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a program of the runtime on this computer, whatever libraries that has, in a sandbox with what it needs:
+    it loads plug-ins, whose code runs then."""
+    tree, programs = tools.tree(read_lock(runtime_lock(system))), _programs(system)
+    argv = tools.command(tree, programs / "usr/bin" / program, system.architecture)
+    environment = {"LC_ALL": "C.UTF-8", "PATH": "/usr/bin"}
+    sandboxed = sandbox.command(
+        [*argv, *arguments], readable=[tree, programs, *needed], environment=environment, seconds=_CHECK_SECONDS,
+        file_bytes=_CHECK_BYTES,
+    )  # fmt: skip
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as said:  # to which the limit applies
+        done = subprocess.run(sandboxed, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=said, check=False)
+        said.seek(0)
+        return subprocess.CompletedProcess(done.args, done.returncode, stderr=said.read())
 
 
 def source_files() -> list[Path]:

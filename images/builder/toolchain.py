@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flotilla.common import namespace, paths
+from flotilla.common import namespace, paths, sandbox
 from flotilla.fleet.model import Board
 from images.builder import pool, tools
 from images.builder.chroot import Chroot
@@ -42,20 +41,16 @@ def compile_static(source: Path, board: Board, options: Sequence[str] = ()) -> b
 
 
 def run(lock_name: str, work: Path, command: Sequence[str], log: Path) -> None:
-    """Run a command among the packages of a lock, where `work` is /out; errors are its own words, kept in `log`."""
+    """Run a command among the packages of a lock, where `work` is /out; errors are its own words, kept in `log`.
+
+    It runs in a sandbox: Makefiles, and options of compilers, are others' code.
+    """
     lock = read_lock(lock_name)
     pool.fill([lock])
-    stage = {"tools": str(tools.tree(lock)), "epoch": lock.epoch, "out": str(work), "command": list(command)}
-    namespace.run_stage(__name__, [json.dumps(stage)], log)
-
-
-def main(description: str) -> None:
-    """The stage: one command in a chroot of the toolchain."""
-    stage = json.loads(description)
-    chroot = Chroot(Path(stage["tools"]), stage["epoch"])
-    chroot.provide_system(out=stage["out"])
-    chroot.log(*stage["command"])
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+    chroot = Chroot(Path("/"), lock.epoch)
+    moved = {"/run/faketime": Path(os.environ["FAKETIME_LIBRARIES"])} if chroot.clock else {}
+    argv = sandbox.command(
+        [*chroot.clock, *command], root=tools.tree(lock), writable={"/out": work}, mounted=moved,
+        environment=chroot.environment,
+    )  # fmt: skip
+    namespace.run_logged(__name__, argv, log)

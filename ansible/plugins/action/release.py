@@ -13,7 +13,7 @@ from typing import Any
 from ansible.errors import AnsibleActionFail
 
 from ansible.plugins.action import ActionBase
-from flotilla.common import paths, progress
+from flotilla.common import paths, progress, text
 from flotilla.common.errors import UserError
 from flotilla.robot import answers, provision, release
 from flotilla.updates import multicast, staging
@@ -195,14 +195,14 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         return {"changed": True, "told": self._update("activate")}
 
     def _confirm(self) -> dict[str, Any]:
-        return {"changed": True, "told": answers.shown(self._run("flotilla-slot confirm"))}
+        return {"changed": True, "told": text.shown(self._run("flotilla-slot confirm"))}
 
     def _back(self) -> dict[str, Any]:
         state = answers.judged(self._name, _parsed(self._run("flotilla-slot show")), answers.Release)
         other = "B" if state["running"] == "A" else "A"
         if not state["slots"][other]["ok"]:
             raise AnsibleActionFail(f"slot {other} holds no release that worked: there is nothing to go back to")
-        return {"changed": True, "told": answers.shown(self._run(f"flotilla-slot trial {other}"))}
+        return {"changed": True, "told": text.shown(self._run(f"flotilla-slot trial {other}"))}
 
     # --- what they have in common ---
 
@@ -231,7 +231,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         done = self._low_level_execute_command(command, in_data=content)
         if done["rc"]:
             said = done["stderr"].strip().splitlines() or done["stdout"].strip().splitlines() or ["nothing"]
-            raise AnsibleActionFail(f"{command}: {answers.shown(said[-1])}")
+            raise AnsibleActionFail(f"{command}: {text.shown(said[-1])}")
         return str(done["stdout"])
 
 

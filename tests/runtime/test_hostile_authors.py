@@ -1,0 +1,249 @@
+"""Apps and units with code against whoever builds and checks them, on the computer that has the keys.
+
+Each tries to read a planted key, to write outside its folder, to reach the network, or to change its root directory.
+"""
+
+from __future__ import annotations
+
+import io
+import socket
+import subprocess
+import tarfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from flotilla.apps import app, builder, remote, remote_compiler, scaffold
+from flotilla.common.errors import UserError
+from flotilla.fleet.model import Board, Fleet
+from images.builder import runtime
+from images.builder.lock import HOST
+
+SECRET = "the key of a release"
+ATTACK = """\
+#define _GNU_SOURCE
+#include <arpa/inet.h>
+#include <fcntl.h>
+#include <sched.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+int main(void)
+{
+    return 0;
+}
+
+__attribute__((constructor)) static void attack(void)
+{
+    char key[64] = "";
+    struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons(PORT), .sin_addr = {htonl(0x7f000001)}};
+    int file = open(KEY, O_RDONLY), out = open(MARKER, O_CREAT | O_WRONLY, 0644), breaks = 0;
+    if (file >= 0 && read(file, key, sizeof key - 1) > 0)
+        breaks = fprintf(stderr, "has read %s\\n", key);
+    if (out >= 0)
+        close(out);
+    if (connect(socket(AF_INET, SOCK_STREAM, 0), (struct sockaddr *)&to, sizeof to) == 0)
+        breaks = fprintf(stderr, "reached the network\\n");
+    if (unshare(CLONE_NEWNS) == 0) /* of this process alone: a test that fails must not change the computer */
+        breaks = fprintf(stderr, "may mount\\n");
+    if (chroot(".") == 0)
+        breaks = fprintf(stderr, "changed its root\\n");
+    fprintf(stderr, "ran, and broke %s\\n", breaks ? "out" : "nothing");
+    if (CRASH)
+        abort();
+    exit(1);
+}
+"""
+"""Compiled with KEY, MARKER, PORT and CRASH."""
+
+
+@pytest.fixture
+def defines(tmp_path: Path) -> Iterator[list[str]]:
+    """Of ATTACK; somebody listens at the port."""
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "keys/release").write_text(SECRET)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        yield [f'-DKEY="{tmp_path}/keys/release"', f'-DMARKER="{tmp_path}/marker"', f"-DPORT={port}"]
+
+
+@pytest.fixture
+def plugins(tmp_path: Path, defines: list[str]) -> Callable[[int], Path]:
+    """The directory with a plug-in that attacks as soon as it is loaded, and may crash then."""
+
+    def compiled(crash: int) -> Path:
+        (tmp_path / "attack.c").write_text(ATTACK)
+        command = ["cc", "-shared", "-fPIC", *defines, f"-DCRASH={crash}", "-o", "attack.so", "attack.c"]
+        (tmp_path / "blocks").mkdir()
+        subprocess.run([*command[:-3], "-o", tmp_path / "blocks/attack.so", tmp_path / "attack.c"], check=True)
+        return tmp_path / "blocks"
+
+    return compiled
+
+
+@pytest.mark.parametrize("crash", [0, 1])
+@pytest.mark.parametrize("checked", ["plug-in", "task"])
+def test_a_plugin_that_is_checked_reaches_nothing(
+    plugins: Callable[[int], Path], tmp_path: Path, checked: str, crash: int
+) -> None:
+    """Seen to fail: `has read the key of a release`, `wrote a file`, `reached the network`, `changed its root`."""
+    directory, task = plugins(crash), b"period: 10 ms\nblocks:\n  a: {type: attack}\n"
+    checks = {
+        "plug-in": lambda: runtime.check_plugins(directory, HOST),
+        "task": lambda: runtime.check_task(tmp_path / "task.yml", task, directory, HOST),
+    }
+    with pytest.raises(UserError) as refused:
+        checks[checked]()
+    said = str(refused.value).splitlines()
+    assert "ran, and broke nothing" in said
+    assert bool(crash) == any("was ended by SIGABRT" in line for line in said)
+    assert not (tmp_path / "marker").exists()
+
+
+@pytest.fixture
+def board(fleet: Fleet) -> Board:
+    return next(board for board in fleet.boards.values() if board.system == HOST)
+
+
+@pytest.fixture
+def made(tmp_path: Path, board: Board, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Build an app with a Makefile, by the locked compiler; what goes to a robot."""
+    scaffold.create("make", "hover", tmp_path)
+
+    def make(makefile: str, keys: str = "") -> Path:
+        (tmp_path / "hover/Makefile").write_text(makefile)
+        (tmp_path / "hover/app.yml").write_text(f"kind: make\nprogram: hover\n{keys}")
+        builder.build(app.load(tmp_path / "hover"), board, tmp_path / "out")
+        return tmp_path / "out"
+
+    return make
+
+
+def test_a_makefile_reaches_nothing(made: Callable[..., Path], tmp_path: Path, defines: list[str]) -> None:
+    """Seen to fail: `reached the network`."""
+    (tmp_path / "hover/attack.c").write_text(ATTACK)
+    words = " ".join(f"'{each}'" for each in [*defines, "-DCRASH=0"])
+    out = made(f"hover:\n\t$(CC) {words} -o attack attack.c\n\t./attack 2>hover; ls {tmp_path} >>hover 2>&1; true\n")
+    assert (out / "hover").read_text().splitlines()[0] == "ran, and broke nothing"
+    assert "No such file" in (out / "hover").read_text()
+    assert not (tmp_path / "marker").exists()
+
+
+LINKS = {
+    "the program": ("ln -sf {key} hover", ""),
+    "data": ("cp main.c hover && ln -s {key} data", "files: [data]\n"),
+    "data in a directory": ("cp main.c hover && mkdir data && ln -s {key} data/key", "files: [data]\n"),
+    "a directory": ("cp main.c hover && ln -s {keys} data", "files: [data/release]\n"),
+    "the headers": ("cp main.c hover && rm -rf ../include && ln -s {keys} ../include", ""),
+    "a pipe": ("mkfifo hover", ""),
+}
+
+
+@pytest.mark.parametrize(("commands", "keys"), LINKS.values(), ids=LINKS.keys())
+def test_what_a_build_leaves_is_read_where_it_is_a_file_of_its_own(
+    made: Callable[..., Path], tmp_path: Path, defines: list[str], commands: str, keys: str
+) -> None:
+    """Seen to fail: the key went to the robot as the program, and as a directory's file."""
+    recipe = commands.format(key=tmp_path / "keys/release", keys=tmp_path / "keys")
+    with pytest.raises(UserError, match=r"leads out of|is neither a file"):
+        made(f"hover:\n\t{recipe}\n.PHONY: hover\n", keys)
+    assert not any(SECRET in path.read_text(errors="replace") for path in tmp_path.glob("out/**/*") if path.is_file())
+
+
+ANSWERS: dict[str, Callable[[tarfile.TarFile, Path], None]] = {
+    "a link to a key as the plug-in": lambda tar, keys: add(tar, "plugin.so", link=keys / "release"),
+    "a link over the headers": lambda tar, keys: add(tar, "include", link=keys),
+    "a path that leads out": lambda tar, keys: add(tar, "../../marker", b"x"),
+    "a path from the root": lambda tar, keys: add(tar, f"{keys}/../marker", b"x"),
+    "a file behind a link": lambda tar, keys: behind_a_link(tar, keys.parent),
+    "a device": lambda tar, keys: add(tar, "plugin.so", kind=tarfile.CHRTYPE),
+    "a pipe": lambda tar, keys: add(tar, "plugin.so", kind=tarfile.FIFOTYPE),
+    "a directory": lambda tar, keys: add(tar, "plugin.so", kind=tarfile.DIRTYPE),
+    "a huge file of holes": lambda tar, keys: add(tar, "plugin.so", b"x", sparse_bytes=1 << 45),
+}
+
+
+def add(
+    tar: tarfile.TarFile,
+    name: str,
+    content: bytes = b"",
+    *,
+    link: Path | None = None,
+    kind: bytes = b"",
+    sparse_bytes: int = 0,
+) -> None:
+    member = tarfile.TarInfo(name)
+    member.size, member.type, member.mode = len(content), kind or tarfile.REGTYPE, 0o644
+    if link:
+        member.type, member.linkname = tarfile.SYMTYPE, str(link)
+    if sparse_bytes:
+        member.pax_headers = {
+            "GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.name": name, "GNU.sparse.numblocks": "1",
+            "GNU.sparse.size": str(sparse_bytes), "GNU.sparse.map": f"{sparse_bytes - 1},1",
+        }  # fmt: skip
+    tar.addfile(member, io.BytesIO(content))
+
+
+def behind_a_link(tar: tarfile.TarFile, place: Path) -> None:
+    add(tar, "x", link=place)
+    add(tar, "x/marker", b"x")
+
+
+@pytest.fixture
+def robots_plugin(
+    tmp_path: Path, fleet: Fleet, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[bytes], bytes]:
+    """The plug-in that a robot compiles, when it answers with that."""
+    compiler = tmp_path / "compiler"
+    compiler.write_text("")
+    monkeypatch.setattr(remote_compiler, "packed", lambda lock: compiler)
+    script = tmp_path / "robot"
+    script.write_text(
+        "#!/bin/sh\ncase $* in *'flotilla has-compiler '*) echo yes ;; "
+        f"*) cat >/dev/null; exec cat {tmp_path}/answer; esac\n"
+    )
+    script.chmod(0o755)
+    robot = next(robot for robot in fleet.robots.values() if robot.board == board.name)
+    to = remote.Connection(robot, [str(script)])
+
+    def compiled(answer: bytes) -> bytes:
+        (tmp_path / "answer").write_bytes(answer)
+        source = tmp_path / "source.c"
+        source.write_text("#include <flotilla/block.h>\n")
+        return runtime.compile_plugin(source, HOST, run=remote_compiler.Compiler(to, "hover").run)
+
+    return compiled
+
+
+@pytest.mark.parametrize("answer", ANSWERS.values(), ids=ANSWERS.keys())
+def test_a_robot_that_compiles_returns_one_file(
+    robots_plugin: Callable[[bytes], bytes], tmp_path: Path, answer: Callable[[tarfile.TarFile, Path], None]
+) -> None:
+    """Seen to fail: the key came as the plug-in, a pipe was waited for without end, the rest ended in a traceback."""
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "keys/release").write_text(SECRET)
+    sent = io.BytesIO()
+    with tarfile.open(fileobj=sent, mode="w", format=tarfile.PAX_FORMAT) as tar:
+        answer(tar, tmp_path / "keys")
+    with pytest.raises(UserError) as refused:
+        robots_plugin(sent.getvalue())
+    assert str(refused.value)
+    assert sorted(path.name for path in (tmp_path / "keys").iterdir()) == ["release"]
+    assert (tmp_path / "keys/release").read_text() == SECRET
+    assert not (tmp_path / "marker").exists()
+
+
+def test_a_robot_that_compiles_and_does_not_end(
+    robots_plugin: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remote, "MADE_BYTES", 1 << 16)
+    with pytest.raises(UserError, match="its answer does not end"):
+        robots_plugin(bytes(1 << 20))
+
+
+def test_a_robot_that_compiles_returns_what_is_no_archive(robots_plugin: Callable[[bytes], bytes]) -> None:
+    with pytest.raises(UserError, match=r"robot\d+: what it compiled is no archive"):
+        robots_plugin(b"hello" * 1000)
