@@ -33,6 +33,8 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
     """
     paths.BUILD.mkdir(parents=True, exist_ok=True)
     sources.files(subject.directory)  # refuses what cannot be sent
+    if not isinstance(subject.description, app.Make):  # whose links stay links
+        _check_links(subject.directory)
     with cache.exclusive(), progress.step(f"{subject.name} for {board.system}"):
         (out / "unit.d").mkdir(parents=True)  # what the app's service has beyond runtime/systemd/
         description = subject.description
@@ -59,6 +61,15 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
                 (out / "unit.d" / privileges.DROP_IN).write_text(privileges.IO_PORTS)
         except UserError as error:
             raise UserError(f"{paths.shown(subject.directory)}: nothing was built: {error}") from None
+
+
+def _check_links(directory: Path) -> None:
+    """Refuse links by which an app would get any file of this computer: those to beside the app, shared by several, do
+    no harm."""
+    for path in sources.files(directory):
+        if path.is_symlink() and not sources.inside(directory.parent, path):
+            where = paths.shown(directory.parent)
+            raise UserError(f"{paths.shown(path)}: is a link that leads out of {where}; put a copy in its place")
 
 
 def _drives(description: app.Make, out: Path) -> bool:

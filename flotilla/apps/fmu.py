@@ -24,7 +24,7 @@ import jinja2
 from flotilla.apps import app
 from flotilla.common import paths, progress
 from flotilla.common.errors import Problem, UserError
-from flotilla.common.sources import ignored
+from flotilla.common.sources import ignored, strays
 from flotilla.fleet.model import System
 from images.builder import runtime, toolchain
 
@@ -58,6 +58,15 @@ _SIGNALS = {
 """The runtime's types by FMI's; text can be a parameter only, and what has none is left out."""
 _C_TYPES = {"double": "double", "single": "float", "boolean": "bool"}
 """Of elements; those of integers are regular."""
+_DEFINED = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\([A-Za-z0-9_, .]*\))?")
+"""A preprocessor's definition, which may have arguments."""
+_OPTIONS = re.compile(
+    r"-O[0-3sg]?|-g[0-3]?|-std=[a-z0-9:+]+|-ansi|-pedantic|-pthread|-m32|-m64|-msse[234]?|-mfpmath=sse|-w|-W[a-z][a-z0-9=+-]*"
+    r"|-f(no-)?(PIC|pic|strict-aliasing|math-errno|fast-math|finite-math-only|trapping-math|rounding-math|wrapv|common"
+    r"|signed-zeros|signed-char|unsigned-char|omit-frame-pointer|exceptions|unroll-loops|tree-vectorize|short-enums)"
+    r"|-fvisibility=(hidden|default)|-ffp-contract=(off|on|fast)|-fmax-errors=[0-9]+|-[DU][A-Za-z_][A-Za-z0-9_]*(=[A-Za-z0-9_.+\"'-]*)?"
+)
+"""What a unit may ask of the compiler. Others name files, or programs that the compiler starts."""
 _RANGES = {
     "boolean": (0, 0), "text": (0, 0), "double": (-math.inf, math.inf), "single": (-3.4028234e38, 3.4028234e38),
     "int64": (-(2.0**63), 2.0**63), "uint64": (0, 2.0**64),
@@ -168,6 +177,8 @@ def unpacked(directory: Path, wanted: str | None, work: Path) -> tuple[Path, str
     file = directory / wanted if wanted else _only(directory)
     shown = paths.shown(file)
     if file.is_dir():
+        for path, what in strays(file).items():
+            raise UserError(f"{paths.shown(path)}: {what}; put a copy in its place")
         return file, shown
     if not file.is_file():
         where = paths.shown(directory / app.FILE)
@@ -400,12 +411,27 @@ def _build_description(unit: Unit, file: Path, shown: str, platform: str) -> Sou
             raise _wrong(shown, "language", language, "is not C", "export the unit as C, or a binary")
         files += [each.get("name", "") for each in group.iterfind("SourceFile")]
         for definition in group.iterfind("PreprocessorDefinition"):
-            value = definition.get("value")
-            options.append(f"-D{definition.get('name', '')}" + (f"={value}" if value is not None else ""))
+            name, value = definition.get("name", ""), definition.get("value")
+            if not _DEFINED.fullmatch(name):
+                raise _wrong(shown, "PreprocessorDefinition", name, "is no name", "export the unit anew")
+            options.append(f"-D{name}" + (f"={value}" if value is not None else ""))
         options += [f"-Isources/{each.get('name', '')}" for each in group.iterfind("IncludeDirectory")]
         if group.get("compiler") == "gcc":
-            options += shlex.split(group.get("compilerOptions") or "")
+            options += _compiler_options(group.get("compilerOptions") or "", shown)
     return Sources(files, options)
+
+
+def _compiler_options(text: str, shown: str) -> list[str]:
+    """Those of gcc, if they are among _OPTIONS."""
+    try:
+        options = shlex.split(text)
+    except ValueError as error:
+        raise _wrong(shown, "compilerOptions", text, f"cannot be read: {error}", "export the unit anew") from None
+    for option in options:
+        if not _OPTIONS.fullmatch(option):
+            message = "is not among the options that a unit may have"
+            raise _wrong(shown, "compilerOptions", option, message, "export the unit without, or a binary")
+    return options
 
 
 def binary(unit: Unit, system: System) -> Path:

@@ -59,6 +59,11 @@ is_there() {
     diff -rq --no-dereference "$1" "$apps/.$name@$version" >/dev/null 2>&1
 }
 
+# Run a program as the app will run: what it loads is the app's code, which must not run as root.
+as_app() {
+    timeout -k 5 60 setpriv --reuid=app --regid=app --clear-groups --bounding-set=-all --inh-caps=-all --no-new-privs "$@"
+}
+
 # Take the app's files from standard input, and put them in the place of what is there once nothing can fail any more:
 # VERSION of the files, KiB that must be free, PROGRAM or nothing.
 receive() {
@@ -73,11 +78,11 @@ receive() {
     mkdir "$part"
     tar -x --no-same-owner -C "$part"
     for task in "$part/task.yml" "$part/safe.yml"; do
-        [ ! -e "$task" ] || flotilla-run --check --blocks "$part/blocks:/usr/lib/flotilla/blocks" "$task" ||
+        [ ! -e "$task" ] || as_app flotilla-run --check --blocks "$part/blocks:/usr/lib/flotilla/blocks" "$task" ||
             refuse "its runtime refuses the app; nothing was changed"
     done
     if [ "$program" ]; then
-        ! ldd -r "$part/$program" 2>&1 | grep -e "not found" -e "undefined symbol" >&2 ||
+        ! as_app ldd -r "$part/$program" 2>&1 | grep -e "not found" -e "undefined symbol" >&2 ||
             refuse "$program needs libraries or functions that are missing on the robot; nothing was changed"
     fi
     sync -f "$part"
@@ -239,7 +244,7 @@ stop)
     systemctl stop "$unit"
     ;;
 statistics)
-    [ ! -e "$statistics" ] || cat "$statistics"
+    [ ! -e "$statistics" ] || as_app head -c 16M "$statistics" # a link leads no further than the app itself may read
     ;;
 status)
     there

@@ -6,15 +6,20 @@ Each tries to read a planted key, to write outside its folder, to reach the netw
 from __future__ import annotations
 
 import io
+import os
+import re
+import shutil
 import socket
 import subprocess
 import tarfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import pytest
 
-from flotilla.apps import app, builder, remote, remote_compiler, scaffold
+from flotilla.apps import app, builder, fmu, remote, remote_compiler, scaffold
+from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
 from images.builder import runtime
@@ -247,3 +252,94 @@ def test_a_robot_that_compiles_and_does_not_end(
 def test_a_robot_that_compiles_returns_what_is_no_archive(robots_plugin: Callable[[bytes], bytes]) -> None:
     with pytest.raises(UserError, match=r"robot\d+: what it compiled is no archive"):
         robots_plugin(b"hello" * 1000)
+
+
+OPTIONS = {
+    "a wrapper": "-wrapper /bin/sh,-c,id",
+    "a plug-in of the compiler": "-fplugin=./sources/x.so",
+    "specifications": "-specs=sources/x",
+    "programs of its own": "-B sources/",
+    "a file of options": "@sources/x",
+    "a linker of its own": "-fuse-ld=x",
+    "options of the linker": "-Wl,-rpath,/tmp",
+    "options of the assembler": "-Wa,-I/",
+    "a header from anywhere": "-include /etc/passwd",
+    "a directory": "-I/root",
+    "an output": "-o /out/x",
+    "no words": "-O2 'x",
+}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_a_unit_asks_the_compiler_for_what_is_harmless_alone(tmp_path: Path, options: str) -> None:
+    """Seen to fail: all of them reached the compiler, `-wrapper` with a program to start."""
+    shutil.copytree(paths.PROJECT / "tests/fixtures/fmu", tmp_path / "two-lags/unit")
+    unit = fmu.read(*fmu.unpacked(tmp_path / "two-lags", None, tmp_path / "unpacked"))
+    description = tmp_path / "two-lags/unit/sources/buildDescription.xml"
+
+    def asking(options: str) -> fmu.Sources | None:
+        group = f'<SourceFileSet compiler="gcc" compilerOptions={quoteattr(options)}'
+        description.write_text(re.sub('<SourceFileSet language="C99"', lambda _: group, original))
+        return fmu.sources(unit, HOST)
+
+    original = description.read_text()
+    with pytest.raises(UserError, match="compilerOptions: "):
+        asking(options)
+    found = asking("-O2 -std=c99 -Wall -fno-math-errno -ffast-math -DA=1")
+    assert found
+    assert "-ffast-math" in found.options
+
+
+def test_a_unit_with_a_link_that_leads_out_is_refused(tmp_path: Path) -> None:
+    """Seen to fail: `resources/x` was shipped with what it led to."""
+    shutil.copytree(paths.PROJECT / "tests/fixtures/fmu", tmp_path / "two-lags/unit")
+    (tmp_path / "two-lags/unit/resources").mkdir(exist_ok=True)
+    (tmp_path / "two-lags/unit/resources/x").symlink_to("/etc/hostname")
+    with pytest.raises(UserError, match=r"resources/x: leads out of .*; put a copy in its place"):
+        fmu.unpacked(tmp_path / "two-lags", None, tmp_path / "unpacked")
+
+
+def test_an_app_with_a_link_to_any_file_of_this_computer_is_refused(tmp_path: Path, board: Board) -> None:
+    """Seen to fail: the app was built; an assembler's `.incbin` puts such a file into the plug-in."""
+    scaffold.create("block", "mine", tmp_path)
+    (tmp_path / "shared.h").write_text("")
+    (tmp_path / "mine/beside.h").symlink_to("../shared.h")
+    (tmp_path / "mine/key").symlink_to("/etc/hostname")
+    with pytest.raises(UserError, match=r"mine/key: is a link that leads out of"):
+        builder.build(app.load(tmp_path / "mine"), board, tmp_path / "out")
+
+
+AS_APP = """#!/bin/sh
+case " $* " in *" --reuid=app --regid=app --clear-groups --bounding-set=-all --inh-caps=-all --no-new-privs "*) ;;
+*) exit 1 ;; esac
+while case $1 in --*) ;; *) false ;; esac; do shift; done
+AS=app exec "$@"
+"""
+RECORDS = """#!/bin/sh
+echo "{name} as ${{AS:-root}}" >>{log}
+exit 1
+"""
+
+
+def test_a_robot_runs_no_code_of_an_app_as_root_to_check_it(tmp_path: Path) -> None:
+    """The robot's script, with programs in place of its own that record who starts them, and refuse the app.
+
+    Seen to fail: `flotilla-run as root`, so a plug-in's constructor was root; root's `cat` followed an app's link."""
+    log, programs, apps = tmp_path / "log", tmp_path / "bin", tmp_path / "apps"
+    programs.mkdir()
+    texts = {name: RECORDS.format(name=name, log=log) for name in ("flotilla-run", "ldd", "head", "cat")}
+    for name, text in {**texts, "setpriv": AS_APP}.items():
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    script = remote.SCRIPT.read_text().replace("/data/apps", str(apps)).replace("/var/lib/flotilla-apps", str(apps))
+    environment = os.environ | {"PATH": f"{programs}:{os.environ['PATH']}"}
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        add(tar, "task.yml")
+    (apps / "hover").mkdir(parents=True)
+    (apps / "hover/statistics.json").write_text("{}")
+    for words in (["receive", "hover", "1", "1", ""], ["statistics", "hover"]):
+        argv = ["sh", "-c", script, "flotilla", *words]
+        done = subprocess.run(argv, env=environment, input=archive.getvalue(), capture_output=True, check=False)
+        assert done.returncode, done.stderr
+    assert log.read_text().splitlines() == ["flotilla-run as app", "head as app"]
