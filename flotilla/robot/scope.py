@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import shlex
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
+from flotilla.common.text import shown
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 
 _PROGRAM = "flotilla-scope"
+_LINE = 1 << 16
+"""Bytes of a line that is shown; a longer one is taken apart."""
 
 
 def words(
@@ -70,13 +74,21 @@ def _keep(beside: Path, file: Path) -> int:
 
 def _run(robot: Robot, command: Sequence[str], stdout: int | None) -> None:
     argv = [*ssh.command(robot), shlex.join(command)]
-    with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=stdout, stderr=subprocess.PIPE) as process:
+    with (
+        tempfile.TemporaryFile() as complaints,
+        subprocess.Popen(
+            argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE if stdout is None else stdout, stderr=complaints
+        ) as process,
+    ):
         try:
-            _, said = process.communicate()
-        except KeyboardInterrupt:
+            while process.stdout and (line := process.stdout.readline(_LINE)):
+                print(shown(line.decode("utf-8", "replace")), end="", flush=True)
+            process.wait()
+        except BaseException:
             process.terminate()
             raise
-    reason = said.decode("utf-8", "replace").strip()
+        complaints.seek(0)
+        reason = shown(complaints.read(_LINE).decode("utf-8", "replace").strip())
     if process.returncode == ssh.FAILED:
         raise ssh.no_answer(robot, reason)
     if process.returncode:

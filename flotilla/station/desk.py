@@ -19,6 +19,7 @@ from typing import Any
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.common.text import shown
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.robot import parameters, scope
 from flotilla.station import page_requests as asked
@@ -163,7 +164,8 @@ class Desk:
     # What goes to browsers
 
     def note(self, text: str) -> None:
-        """On the terminal and on the page."""
+        """On the terminal and on the page, control characters of others shown as such."""
+        text = shown(text)
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
         note = {"type": "note", "at": time.time(), "text": text}
@@ -510,7 +512,7 @@ class Desk:
                     lost = sum(row[1] for row in batch)
                     session.tell({"type": "rows", "id": request.id, "rows": rows, "lost": lost})
             except (UserError, OSError, ValueError) as error:
-                good, text = False, f"{error}"
+                good, text = False, shown(f"{error}")
             own.watches.pop(request.id, None)
             session.tell({"type": "answer", "id": request.id, "good": good, "text": text})
 

@@ -10,12 +10,16 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
+
+import pydantic
 
 from flotilla.common.errors import UserError
 from flotilla.common.processes import DIE_WITH_PARENT
+from flotilla.common.text import shown
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 
@@ -31,6 +35,32 @@ _TIME = "echo $(chronyc -n ntpdata 2>/dev/null | grep RX)"
 _PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
 _SETTINGS = ("ServerAliveInterval=5", "ServerAliveCountMax=4")
 """A busy robot takes its time to let somebody in: no less than `ssh.options` gives every command."""
+
+
+_LONGEST = 1 << 16
+"""Bytes of a task's status, and half of those of any line."""
+_WORDS = 200
+"""Characters of what is shown of a robot's words."""
+_NONSENSE = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError)
+
+_Name = Annotated[str, pydantic.StringConstraints(pattern=r"^[A-Za-z0-9_.\[\]-]{1,64}$")]
+_Count = Annotated[int, pydantic.Field(ge=0, le=2**63)]
+
+
+class _Sensor(pydantic.BaseModel):
+    flag: bool
+
+
+class _Report(pydantic.BaseModel):
+    """What runtime/executive/status.h writes, of which the station shows this."""
+
+    task: _Name
+    period_s: float = pydantic.Field(gt=0, le=3600, allow_inf_nan=False)
+    overruns: _Count
+    sensors: dict[_Name, _Sensor] = pydantic.Field(max_length=256)
+    refused: dict[_Name, dict[_Name, _Count]] = pydantic.Field({}, max_length=256)
+    waiting: list[_Name] = pydantic.Field([], max_length=256)
+    serial_overruns: dict[_Name, _Count] = pydantic.Field({}, max_length=256)
 
 
 @dataclass(frozen=True)
@@ -95,7 +125,11 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
     longest = 4 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
-    status = "; ".join(f"flotilla-param --status=json {task} 2>/dev/null || echo null" for task in robot.control_tasks)
+    # One line for each task, whatever it writes.
+    status = "; ".join(
+        f"printf '%s\\n' \"$(flotilla-param --status=json {task} 2>/dev/null | head -c {_LONGEST} | tr -d '\\n')\""
+        for task in robot.control_tasks
+    )
     notes = f"cat {_CELL} 2>/dev/null || echo; {_FLOOD} 2>/dev/null || echo null; {_TIME}"
     script = f"while cat /proc/uptime && {show} && {{ {status}; {notes}; }} && echo {_END}; do sleep {ASK_S}; done"
     before: dict[str, State] = {}
@@ -108,18 +142,23 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
             assert process.stdout
             assert process.stderr
             lines: list[str] = []
-            for line in process.stdout:
+            for line in iter(partial(process.stdout.readline, 2 * _LONGEST), ""):
+                if not line.endswith("\n"):
+                    raise UserError(f"{robot.name}: says of its tasks a line that does not end")
                 if line.rstrip() != _END and len(lines) < longest:
                     lines.append(line)
                     continue
                 try:
                     *lines, cell, flood, clock = lines
-                    before = _states(lines[: -len(units)], lines[-len(units) :], before)
-                    yield Answer(before, tuple(_notes(cell.strip(), json.loads(flood), clock)))
-                except (ValueError, KeyError, TypeError) as error:
-                    raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {error!r}") from error
+                    reports, odd = _reports(robot.control_tasks, lines[-len(units) :], before)
+                    before = _states(lines[: -len(units)], robot.control_tasks, reports)
+                    answer = Answer(before, (*odd, *_notes(cell.strip(), json.loads(flood), clock)))
+                except _NONSENSE as error:
+                    what = shown(repr(error)[:200])
+                    raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {what}") from error
+                yield answer
                 lines = []
-            raise ssh.no_answer(robot, process.stderr.read().strip() or "the connection broke")
+            raise ssh.no_answer(robot, shown(process.stderr.read(_LONGEST).strip()) or "the connection broke")
         finally:
             process.kill()
 
@@ -127,7 +166,7 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
 def _notes(cell: str, flood: dict[str, Any] | None, clock: str) -> Iterator[str]:
     """`flood`: a chain as libnftables-json(5) describes it; None: the robot has none. `clock`: of all time servers."""
     if cell not in ("", _IN_THE_CELL):
-        yield f"radio {cell}"
+        yield f"radio {shown(cell[:_WORDS])}"
     rules = [each["rule"]["expr"] for each in flood["nftables"] if "rule" in each] if flood else []
     if packets := sum(part["counter"]["packets"] for rule in rules for part in rule if "counter" in part):
         yield f"firewall dropped {packets} packets of a flood"
@@ -136,43 +175,60 @@ def _notes(cell: str, flood: dict[str, Any] | None, clock: str) -> Iterator[str]
         yield f"clock refused {came - valid} answers that were not a time server's"
 
 
-def _states(lines: list[str], reported: list[str], before: dict[str, State]) -> dict[str, State]:
-    """What one round says: /proc/uptime, then the services, an empty line between them; and the tasks, a line each."""
-    uptime, _, shown = "".join(lines).partition("\n")
-    reports = {report["task"]: report for report in map(json.loads, reported) if report}
+def _states(lines: list[str], tasks: Sequence[str], reports: Mapping[str, TaskStatus]) -> dict[str, State]:
+    """What one round says: /proc/uptime, then the services, an empty line between them."""
+    uptime, _, blocks = "".join(lines).partition("\n")
     found = {}
-    for block in shown.strip().split("\n\n"):
+    for block in blocks.strip().split("\n\n"):
         unit = dict(line.split("=", 1) for line in block.splitlines())
         task = unit["Id"].removeprefix("flotilla-task@").removesuffix(".service")
+        if task not in tasks:
+            raise ValueError(f"nobody asked for {task}")
         active = unit["ActiveState"] == "active"
         since_s = float(uptime.split()[0]) - int(unit["ActiveEnterTimestampMonotonic"]) / 1e6
         restarts = int(unit["NRestarts"])
         words = (
-            unit["SubState"]
+            shown(unit["SubState"][:_WORDS])
             + (f" {since_s:.0f} s" if active else "")
             + (f", restarted {restarts}×" if restarts else "")
         )
-        past = before[task].status if task in before else None
-        found[task] = State(
-            words, active and not restarts, _status_of(reports[task], past) if task in reports else None
-        )
+        found[task] = State(words, active and not restarts, reports.get(task))
     return found
 
 
-def _status_of(report: dict[str, Any], past: TaskStatus | None) -> TaskStatus:
-    overruns = int(report["overruns"])
+def _reports(
+    tasks: Sequence[str], lines: Sequence[str], before: Mapping[str, State]
+) -> tuple[dict[str, TaskStatus], list[str]]:
+    """By task, a line each, and what is wrong with those that are none: a task whose program somebody replaced says
+    nothing of others, and does not silence them."""
+    found, odd = {}, []
+    for task, line in zip(tasks, lines, strict=True):
+        if not line.strip() or line.strip() == "null":
+            continue
+        try:
+            report = _Report.model_validate_json(line)
+            if report.task != task:
+                raise ValueError(f"it is of {report.task}")
+        except ValueError as error:  # as pydantic's errors are
+            why = error.errors()[0]["msg"] if isinstance(error, pydantic.ValidationError) else str(error)
+            odd.append(f"{task} does not say how it does: its status is none: {shown(why[:_WORDS])}")
+            continue
+        past = before[task].status if task in before else None
+        found[task] = _status_of(report, past)
+    return found, odd
+
+
+def _status_of(report: _Report, past: TaskStatus | None) -> TaskStatus:
+    overruns = report.overruns
     counted = past.overruns if past else overruns
     return TaskStatus(
-        period_s=float(report["period_s"]),
+        period_s=report.period_s,
         overruns=overruns,
         lately=overruns - (counted if counted <= overruns else 0),  # it was started anew
-        flags={name: bool(sensor["flag"]) for name, sensor in report["sensors"].items()},
-        refused={
-            block: {kind: int(count) for kind, count in kinds.items()}
-            for block, kinds in report.get("refused", {}).items()
-        },
-        waiting=[str(block) for block in report.get("waiting", [])],
-        serial_overruns={str(block): int(count) for block, count in report.get("serial_overruns", {}).items()},
+        flags={name: bool(sensor.flag) for name, sensor in report.sensors.items()},
+        refused=report.refused,
+        waiting=report.waiting,
+        serial_overruns=report.serial_overruns,
     )
 
 

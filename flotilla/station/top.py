@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flotilla.common.signals import size
+from flotilla.common.text import shown
 from flotilla.station.dialog import Dialog, TaskOf
 from flotilla.station.receiver import Receiver
 from flotilla.station.recording import Value
@@ -281,7 +282,7 @@ class Top:
         if self._receiver.strangers:
             notes.append(f"{self._receiver.strangers} datagrams of strangers left out")
         if notes:
-            table.caption, table.caption_justify = "\n".join(notes), "left"
+            table.caption, table.caption_justify = Text(shown("\n".join(notes))), "left"
         return table
 
 

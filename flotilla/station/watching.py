@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import shlex
 from collections.abc import AsyncIterator, Sequence
 from typing import Any
@@ -79,11 +80,28 @@ async def rows(robot: Robot, command: Sequence[str], signals: Sequence[str]) -> 
 
 async def _read(lines: asyncio.StreamReader, signals: Sequence[str], batch: asyncio.Queue[list[Any] | None]) -> None:
     """Rows, and None at the end; a line that is none ends them."""
-    with contextlib.suppress(ValueError, KeyError, TypeError):
+    with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError, RecursionError):
         while line := await lines.readline():
             row = json.loads(line)
-            await batch.put([row["release_ns"] / 1e9, row["lost"], *(row[signal] for signal in signals)])
+            times = [_number(row["release_ns"]), _number(row["lost"])]
+            if any(not isinstance(each, int) for each in times):
+                raise ValueError(times)
+            await batch.put([row["release_ns"] / 1e9, row["lost"], *(_values(row[signal]) for signal in signals)])
     await batch.put(None)
+
+
+def _values(value: object) -> object:
+    """Of a signal: a number, or a list of them."""
+    return [_number(each) for each in value] if isinstance(value, list) else _number(value)
+
+
+def _number(value: object) -> float | None:
+    """None of what is not finite, which JSON has no word for; ValueError of what is none."""
+    if value is not None and not isinstance(value, bool | int | float):
+        raise ValueError(value)
+    if isinstance(value, int) and abs(value) >= 1 << 64:
+        raise ValueError(value)
+    return value if value is not None and math.isfinite(value) else None
 
 
 async def _said(stream: asyncio.StreamReader) -> bytes:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Iterator
 from contextlib import closing
 from ipaddress import IPv4Address
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
-from flotilla.station import services
+from flotilla.station import services, watching
 from flotilla.station.services import Answer, State, TaskStatus, ask
 
 ROBOT = Robot(
@@ -121,6 +123,63 @@ def test_what_a_task_refused(robot: Path) -> None:
     assert tasks["sensors"].status == TaskStatus(0.01, 0, 0, {"gyro": False}, {})
 
 
+GOOD = {"task": "valves", "period_s": 0.01, "overruns": 0, "sensors": {}}
+STATUSES = {
+    "NaN as a period": GOOD | {"period_s": float("nan")},
+    "an infinite period": GOOD | {"period_s": float("inf")},
+    "no period": GOOD | {"period_s": 0},
+    "negative overruns": GOOD | {"overruns": -1},
+    "many overruns": GOOD | {"overruns": 10**400},
+    "another task's": GOOD | {"task": "sensors", "overruns": 99},
+    "a list": [1],
+    "a number": 7,
+    "text": "running",
+    "escapes in a sensor's name": GOOD | {"sensors": {"\x1b[2J": {"flag": True}}},
+    "markup in a block's name": GOOD | {"waiting": ["[red]x[/red]\n"]},
+    "a list of sensors": GOOD | {"sensors": []},
+    "many sensors": GOOD | {"sensors": {f"s{i}": {"flag": True} for i in range(1000)}},
+    "refusals that are text": GOOD | {"refused": {"a": {"b": "c"}}},
+}
+LINES = {
+    "a deep nest": "[" * 60000,
+    "a deep object": '{"a":' * 10000,
+    "no JSON": "hello",
+    "several lines": json.dumps(GOOD) + "\n.\n.\nnull\nnull\n.",
+    "a line without an end": "x" * 10_000_000,
+    "escapes alone": "\x1b]0;title\x07",
+    "bytes": "\ufffd\x00\x01",
+}
+
+
+@pytest.mark.parametrize("line", [*map(json.dumps, STATUSES.values()), *LINES.values()], ids=[*STATUSES, *LINES])
+def test_a_task_that_somebody_took_over_says_nothing_of_others(robot: Path, line: str) -> None:
+    """Its answer is none; that of the other one is what it was, and the connection stays.
+
+    Seen to fail: NaN was its period, a deep nest ended the thread that asks, nonsense silenced the other task.
+    """
+    say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
+    tell(robot, valves=0, sensors=7)
+    (robot / "valves").write_text(line + "\n")
+    with closing(ask(ROBOT)) as answers:
+        for answer in (next(answers), next(answers)):
+            assert answer.tasks["sensors"].status == TaskStatus(0.01, 7, 0, {"gyro": False})
+            assert answer.tasks["valves"] == State("running 100 s", True)
+            (note,) = answer.notes
+            assert note.startswith("valves does not say how it does: its status is none: ")
+            assert note.isprintable()
+
+
+@pytest.mark.parametrize("written", ["x" * 10_000_000, "\n".join(["x"] * 100_000), "\x1b[2J"])
+def test_a_robot_that_says_nonsense_ends_its_connection_alone(robot: Path, written: str) -> None:
+    (robot / "nonsense").write_text(written)
+    program(robot, "cat", f"#!/bin/sh\n/bin/cat {robot}/nonsense; while :; do echo .; done\n")
+    say(robot, unit("valves", "active", "running", 0, 53540000), unit("sensors", "active", "running", 0, 53540000))
+    tell(robot, valves=7, sensors=0)
+    with closing(ask(ROBOT)) as answers, pytest.raises(UserError, match="robot3: ") as refused:
+        next(answers)
+    assert str(refused.value).isprintable()
+
+
 @pytest.mark.parametrize(
     ("written", "said"),
     [
@@ -198,3 +257,29 @@ def test_one_that_talks_nonsense(robot: Path, said: str) -> None:
     say(robot, said)
     with pytest.raises(UserError, match=r"^robot3: nobody understands"):
         next(ask(ROBOT))
+
+
+ROW = {"release_ns": 1_000_000_000, "lost": 0, "a": 1.5}
+NO_ROWS = {
+    "a list": [1],
+    "NaN as a time": ROW | {"release_ns": float("nan")},
+    "a huge time": ROW | {"release_ns": 10**400},
+    "text as a signal": ROW | {"a": "\x1b[2J"},
+    "a nest as a signal": ROW | {"a": [[1]]},
+    "lost that is none": ROW | {"lost": []},
+}
+
+
+@pytest.mark.parametrize("line", [*map(json.dumps, NO_ROWS.values()), "[" * 60000], ids=[*NO_ROWS, "a deep nest"])
+def test_rows_of_signals_are_numbers(line: str) -> None:
+    """What is none ends them. Seen to fail: text and nests went on to browsers, a huge time ended the plot's task."""
+
+    async def read(*lines: str) -> list[list[Any] | None]:
+        stream, batch = asyncio.StreamReader(), asyncio.Queue[list[Any] | None]()
+        stream.feed_data("".join(f"{each}\n" for each in lines).encode())
+        stream.feed_eof()
+        await watching._read(stream, ["a"], batch)
+        return [batch.get_nowait() for _ in range(batch.qsize())]
+
+    good, nan = json.dumps(ROW), json.dumps(ROW | {"a": float("nan")})
+    assert asyncio.run(read(good, nan, line, good)) == [[1.0, 0, 1.5], [1.0, 0, None], None]
