@@ -15,6 +15,7 @@ from aiohttp import WSCloseCode, web
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.station.access import HEADERS, Access, RefusedError
+from flotilla.station.admission import Admission, Door
 from flotilla.station.desk import Desk
 from flotilla.station.page_requests import LONGEST
 from flotilla.station.session import Session
@@ -25,6 +26,8 @@ BROWSERS = 16
 """At once."""
 _HEARTBEAT_S = 4.0
 _CLOSE_S = 2.0
+_BACKLOG = 1024
+"""Connections that the kernel keeps until they are accepted; more than an address may hold."""
 _NOTE_EVERY_S = 1.0
 _TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
 
@@ -40,7 +43,9 @@ class Web:
         self._access: Access
         self._numbers = itertools.count(1)
         self._sessions: set[Session] = set()
-        self._refused = 0
+        self._refused = self._ended = 0
+        self._admission = Admission(self._note_ended)
+        self._listening: asyncio.Server
         self._noted_s = 0.0
         self._files = {f"/{file.relative_to(PAGE).as_posix()}": file for file in PAGE.rglob("*") if file.is_file()}
         self._runner: web.AppRunner
@@ -53,17 +58,21 @@ class Web:
         app.router.add_get("/{file:.*}", self._file)
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1)
         await self._runner.setup()
-        site = web.TCPSite(self._runner, self._address, self._port)
+        server = self._runner.server
+        assert server
         try:
-            await site.start()
+            self._listening = await asyncio.get_running_loop().create_server(
+                lambda: Door(server(), self._admission), self._address, self._port, backlog=_BACKLOG, reuse_address=True
+            )
         except OSError as error:
             remedy = "give another port or address of this computer: PORT= ADDRESS="
             raise UserError(f"TCP port {self._port} of {self._address}: {error.strerror}; {remedy}") from error
-        port = self._runner.addresses[0][1]
+        port = self._listening.sockets[0].getsockname()[1]
         self._access = Access(self._address, port, paths.BUILD / "run" / f"page-{port}.token")
         return self._access.url
 
     async def end(self) -> None:
+        self._listening.close()
         await self._runner.cleanup()
 
     @web.middleware
@@ -78,8 +87,17 @@ class Web:
         except RefusedError as error:
             self._note_refused(request, f"{error}")
             text = f"{error}.\nOpen the address that the station printed when it started: it has the token.\n"
-            return web.Response(status=403, text=text, headers=HEADERS)
+            response = web.Response(status=403, text=text, headers=HEADERS)
+            response.force_close()
+            return response
+        self._admission.proven(request.transport)
         return await handler(request)
+
+    def _note_ended(self, address: str) -> None:
+        self._ended += 1
+        if time.monotonic() - self._noted_s >= _NOTE_EVERY_S:
+            self._noted_s = time.monotonic()
+            self._desk.note(f"ended a connection of {address} that has not shown the token ({self._ended} in all)")
 
     def _note_refused(self, request: web.Request, reason: str) -> None:
         """At most once a second: whoever asks sets the pace."""
