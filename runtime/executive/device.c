@@ -1,23 +1,20 @@
 #define _GNU_SOURCE
 #include "device.h"
 
+#include "core/claim.h"
 #include "parameter.h"
 
 #include <errno.h>
 #include <inttypes.h>
 #include <limits.h>
 #include <poll.h>
-#include <stddef.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/socket.h>
-#include <sys/un.h>
 #include <time.h>
 #include <unistd.h>
 
 enum {
-    WAITING = 128,                /* processes that may wait for one device */
-    LISTEN_MS = 50,               /* at least: from bind() to listen() of the holder */
+    LISTEN_MS = 500,              /* at least: from bind() to listen() of the holder */
     LISTEN_POLL_NS = 1000 * 1000, /* there is no event to wait for */
 };
 
@@ -76,48 +73,13 @@ static void write_shown(const struct fl_block *block, FILE *out)
     device_write(block, out);
 }
 
-/* Keep the end of a long name: that is where names differ. */
-static socklen_t address_of(const struct fl_block *block, struct sockaddr_un *address)
+/* Until the holder has ended, or CLOCK_MONOTONIC is `until_ns`. */
+static void wait_for(const struct claim *holder, int64_t until_ns)
 {
-    char *key = text_of(block, write_key);
-    const size_t room = sizeof address->sun_path - 1 - strlen("flotilla/"), length = strlen(key);
-    *address = (struct sockaddr_un){.sun_family = AF_UNIX};
-    int used = snprintf(address->sun_path + 1, sizeof address->sun_path - 1, "flotilla/%s",
-                        key + (length >= room ? length - room + 1 : 0));
-    free(key);
-    return (socklen_t)(offsetof(struct sockaddr_un, sun_path) + 1 + (size_t)used);
-}
-
-/* A listening socket, or -1 with errno: EADDRINUSE where another process has it. */
-static int hold(const struct sockaddr_un *address, socklen_t length)
-{
-    int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
-    if (fd < 0 || (bind(fd, (const struct sockaddr *)address, length) == 0 && listen(fd, WAITING) == 0))
-        return fd;
-    int error = errno;
-    close(fd);
-    errno = error;
-    return -1;
-}
-
-/* Wait until the holder has ended, or CLOCK_MONOTONIC is `until_ns`. Returns its process, or 0 where that is unknown.
- */
-static pid_t wait_for_holder(const struct sockaddr_un *address, socklen_t length, int64_t until_ns)
-{
-    struct ucred holder = {0};
-    socklen_t size = sizeof holder;
-    int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-    if (fd >= 0 && connect(fd, (const struct sockaddr *)address, length) == 0) {
-        getsockopt(fd, SOL_SOCKET, SO_PEERCRED, &holder, &size);
-        int64_t left_ms = (until_ns - fl_now_ns()) / 1000000 + 1; /* each turn takes one of the holder's places */
-        struct pollfd gone = {.fd = fd};
-        poll(&gone, 1, left_ms > 0 ? (int)left_ms : 0);
-    } else {
-        nanosleep(&(struct timespec){.tv_nsec = LISTEN_POLL_NS}, NULL);
-    }
-    if (fd >= 0)
-        close(fd);
-    return holder.pid;
+    int64_t left_ms = (until_ns - fl_now_ns()) / 1000000 + 1; /* each turn takes one of the holder's places */
+    struct pollfd gone = {.fd = holder->fd};
+    poll(&gone, 1, left_ms > 0 ? (int)left_ms : 0);
+    close(holder->fd);
 }
 
 static int refuse(struct fl_block *block, pid_t process)
@@ -144,26 +106,43 @@ static int refuse(struct fl_block *block, pid_t process)
 int device_claim(struct fl_block *block)
 {
     struct fl_service *service = block->service;
-    struct sockaddr_un address;
+    struct claim claim;
     bool any = false;
     for (uint32_t i = 0; i < block->type->parameter_count; i++)
         any |= names_device(&block->type->parameters[i]);
     if (!block->type->safe || !any || service->claim_fd > 0)
         return FL_OK;
-    socklen_t length = address_of(block, &address);
-    int64_t patience_ms = service->patience_ms > LISTEN_MS ? service->patience_ms : LISTEN_MS;
-    int64_t now_ns = fl_now_ns(), until_ns = now_ns + patience_ms * 1000000;
-    for (;;) {
-        service->claim_fd = hold(&address, length);
-        if (service->claim_fd >= 0)
-            return FL_OK;
-        if (errno != EADDRINUSE)
-            return fl_fail(block, "its device cannot be claimed: %s", strerror(errno));
-        pid_t process = wait_for_holder(&address, length, until_ns);
-        now_ns = fl_now_ns();
-        if (now_ns >= until_ns)
-            return refuse(block, process);
+    char *key = text_of(block, write_key);
+    int64_t begun_ns = fl_now_ns(), until_ns = begun_ns + (int64_t)service->patience_ms * 1000000;
+    int64_t listening_ns = begun_ns + LISTEN_MS * INT64_C(1000000);
+    if (until_ns < listening_ns)
+        until_ns = listening_ns;
+    int status = FL_FAILED;
+    for (bool decided = false; !decided;) {
+        /* Whoever has to wait for another process makes outputs safe, which nobody may prevent. */
+        bool late = fl_now_ns() >= until_ns;
+        enum claim_result result =
+            claim_take("flotilla", key, fl_now_ns() >= listening_ns, late && service->patience_ms, &claim);
+        decided = true;
+        if (result == CLAIM_OURS || result == CLAIM_STRANGERS) {
+            service->claim_fd = result == CLAIM_OURS ? claim.fd : 0;
+            status = FL_OK;
+        } else if (result == CLAIM_ERROR) {
+            fl_fail(block, "its device cannot be claimed: %s", strerror(errno));
+        } else if (late) {
+            if (claim.fd >= 0)
+                close(claim.fd);
+            refuse(block, claim.process);
+        } else {
+            decided = false;
+            if (result == CLAIM_HELD)
+                wait_for(&claim, until_ns);
+            else
+                nanosleep(&(struct timespec){.tv_nsec = LISTEN_POLL_NS}, NULL);
+        }
     }
+    free(key);
+    return status;
 }
 
 void device_release(struct fl_service *service)

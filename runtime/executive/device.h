@@ -1,9 +1,8 @@
 /* Exclusive use of devices that parameters name (struct fl_device, FL_EXCLUSIVE).
  *
  * Within a task, two blocks on one device are refused when the task file is read. Between processes, an actuator (a
- * type with `safe`) claims its device before it starts, by an abstract Unix socket named after the device. The kernel
- * releases the socket when the process ends, in whatever way, and tells who holds it. This needs no directory and no
- * privilege, and is local to the network namespace. Sensors on serial ports use a lock of their own, for which they
+ * type with `safe`) claims its device before it starts (core/claim.h). Processes that do not count, such as apps
+ * beside a control task, hold up nobody. Sensors on serial ports use a lock of their own, for which they
  * wait.
  */
 #ifndef FLOTILLA_DEVICE_H

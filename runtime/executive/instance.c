@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "instance.h"
 
+#include "core/claim.h"
+
 #include <errno.h>
 #include <fcntl.h>
 #include <stdbool.h>
@@ -8,8 +10,6 @@
 #include <sys/file.h>
 #include <sys/stat.h>
 #include <unistd.h>
-
-enum { FIRST_LOGIN = 1000 };
 
 /* Who holds a lock for writing on this file; 0 for nobody, 1 where the kernel does not say. */
 static int holder(const struct stat *file)
@@ -29,22 +29,17 @@ static int holder(const struct stat *file)
     return found;
 }
 
-static bool may_log_in(unsigned user)
-{
-    return user == 0 || user >= FIRST_LOGIN;
-}
-
 /* Whether the lock of a process counts, by its user. */
 static bool counts(int process)
 {
     char line[256];
     unsigned user;
-    bool counted = may_log_in(geteuid());
+    bool counted = false;
     snprintf(line, sizeof line, "/proc/%d/status", process);
     FILE *status = fopen(line, "re");
     while (status && fgets(line, sizeof line, status)) {
         if (sscanf(line, "Uid: %u", &user) == 1)
-            counted = counted || may_log_in(user) || user == geteuid();
+            counted = claim_user_counts(user);
     }
     if (status)
         fclose(status);

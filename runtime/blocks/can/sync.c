@@ -1,22 +1,24 @@
-#define _GNU_SOURCE
 #include "sync.h"
 
+#include "core/claim.h"
+
 #include <stddef.h>
-#include <stdio.h>
-#include <sys/socket.h>
-#include <sys/un.h>
 #include <unistd.h>
+
+enum { DEAF = 8 }; /* times that a holder may be found to be none that listens */
 
 void can_sync_claim(struct can_sync *sync, const char *interface)
 {
-    struct sockaddr_un address = {.sun_family = AF_UNIX}; /* abstract: the path begins with a zero */
-    int length = snprintf(address.sun_path + 1, sizeof address.sun_path - 1, "flotilla-can-sync/%s", interface);
+    struct claim claim;
     if (atomic_load(&sync->mine))
         return;
-    if (sync->fd <= 0)
-        sync->fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
-    socklen_t size = (socklen_t)(offsetof(struct sockaddr_un, sun_path) + 1) + (socklen_t)length;
-    atomic_store(&sync->mine, sync->fd > 0 && bind(sync->fd, (struct sockaddr *)&address, size) == 0);
+    enum claim_result result = claim_take("flotilla-can-sync", interface, sync->deaf >= DEAF, false, &claim);
+    sync->deaf = result == CLAIM_DEAF ? sync->deaf + 1 : 0;
+    if (result == CLAIM_OURS)
+        sync->fd = claim.fd;
+    else if (claim.fd >= 0)
+        close(claim.fd);
+    atomic_store(&sync->mine, result == CLAIM_OURS);
 }
 
 void can_sync_release(struct can_sync *sync)
@@ -25,4 +27,5 @@ void can_sync_release(struct can_sync *sync)
     if (sync->fd > 0)
         close(sync->fd);
     sync->fd = 0;
+    sync->deaf = 0;
 }

@@ -1,7 +1,6 @@
 /* Decides which block sends SYNC on a bus: one block of this computer at a time, in any task.
  *
- * The claim is an abstract Unix address named after the interface, which only one socket can have. Like the interface
- * it is local to the network namespace, and the kernel releases it when the process ends, in whatever way.
+ * The claim (core/claim.h) is named after the interface and, like this, is local to the network namespace.
  */
 #ifndef FLOTILLA_CAN_SYNC_H
 #define FLOTILLA_CAN_SYNC_H
@@ -11,6 +10,7 @@
 
 struct can_sync {
     int fd;
+    unsigned deaf; /* times in a row that the holder did not listen */
     _Atomic bool mine;
 };
 

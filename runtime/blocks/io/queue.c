@@ -17,16 +17,31 @@
  * Linux is a file descriptor, and locks of open file descriptions (fcntl(2)) work on it. */
 enum { LOCK_ENDS = 0, LOCK_CHANGE = 2 };
 
-static bool lock(mqd_t descriptor, off_t from, off_t count, short kind, bool wait)
+static bool lock(mqd_t descriptor, off_t from, off_t count, short kind)
 {
     struct flock range = {.l_type = kind, .l_whence = SEEK_SET, .l_start = from, .l_len = count};
-    return fcntl(descriptor, wait ? F_OFD_SETLKW : F_OFD_SETLK, &range) == 0;
+    return fcntl(descriptor, F_OFD_SETLK, &range) == 0;
+}
+
+/* Whoever may open the queue may hold the lock: not for ever. */
+static bool lock_changes(mqd_t descriptor)
+{
+    enum { TRIES = 2000, PAUSE_NS = 1000000 };
+    bool locked = false;
+    for (int i = 0; i < TRIES && !locked; i++) {
+        locked = lock(descriptor, LOCK_CHANGE, 1, F_WRLCK);
+        if (!locked && errno != EAGAIN && errno != EACCES)
+            break;
+        if (!locked)
+            nanosleep(&(struct timespec){.tv_nsec = PAUSE_NS}, NULL);
+    }
+    return locked;
 }
 
 /* Whether only the holder of this descriptor uses the queue; then nobody else can begin to. */
 static bool is_ours_alone(mqd_t descriptor)
 {
-    return lock(descriptor, LOCK_ENDS, 2, F_WRLCK, false);
+    return lock(descriptor, LOCK_ENDS, 2, F_WRLCK);
 }
 
 /* Whether the queue still has its name: the last user may have removed it before this one had its lock. */
@@ -82,7 +97,7 @@ static enum opened settle(struct queue *queue, struct fl_block *block, enum queu
                 queue->name, found.mq_maxmsg, found.mq_msgsize, depth, queue->message_bytes);
         return FAILED;
     }
-    if (!lock(queue->descriptor, LOCK_ENDS + (off_t)end, 1, F_WRLCK, false)) {
+    if (!lock(queue->descriptor, LOCK_ENDS + (off_t)end, 1, F_WRLCK)) {
         fl_fail(block, "another block already %s queue %s", end == QUEUE_SENDER ? "sends to" : "receives from",
                 queue->name);
         return FAILED;
@@ -125,14 +140,15 @@ static enum opened open_once(struct queue *queue, struct fl_block *block, enum q
     }
     share(queue->descriptor);
     enum opened opened = FAILED;
-    if (!lock(queue->descriptor, LOCK_CHANGE, 1, F_WRLCK, true))
-        fl_fail(block, "queue %s cannot be locked: %s", queue->name, strerror(errno));
+    if (!lock_changes(queue->descriptor))
+        fl_fail(block, "queue %s cannot be locked: another process holds its lock: end the tasks that use it",
+                queue->name);
     else if (is_removed(queue->descriptor))
         opened = AGAIN;
     else
         opened = settle(queue, block, end, depth);
     if (opened == OPENED)
-        lock(queue->descriptor, LOCK_CHANGE, 1, F_UNLCK, false);
+        lock(queue->descriptor, LOCK_CHANGE, 1, F_UNLCK);
     else
         mq_close(queue->descriptor);
     return opened;
@@ -173,7 +189,7 @@ void queue_close(struct queue *queue)
         return;
     /* Closing the descriptor releases the locks. A process that is just opening the queue holds the change lock, and
      * keeps the queue. */
-    if (lock(queue->descriptor, LOCK_CHANGE, 1, F_WRLCK, false) && is_ours_alone(queue->descriptor) &&
+    if (lock(queue->descriptor, LOCK_CHANGE, 1, F_WRLCK) && is_ours_alone(queue->descriptor) &&
         !is_removed(queue->descriptor))
         mq_unlink(queue->name);
     mq_close(queue->descriptor);

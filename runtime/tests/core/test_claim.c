@@ -1,0 +1,140 @@
+#define _GNU_SOURCE
+#include "testbed.h"
+
+#include "core/claim.h"
+
+#include <poll.h>
+#include <signal.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <sys/prctl.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+enum { SERVICE = 911, APP = 902, SOCKETS = 8 };
+enum how { LISTENS, DEAF, BUSY };
+
+static char key[32];
+
+static struct sockaddr_un address(int number, socklen_t *length)
+{
+    struct sockaddr_un found = {.sun_family = AF_UNIX};
+    int used = number ? snprintf(found.sun_path + 1, sizeof found.sun_path - 1, "flotilla/%d/%s", number, key)
+                      : snprintf(found.sun_path + 1, sizeof found.sun_path - 1, "flotilla/%s", key);
+    *length = (socklen_t)(offsetof(struct sockaddr_un, sun_path) + 1 + (size_t)used);
+    return found;
+}
+
+/* A process of a user that holds the first sockets of the name until it is killed. */
+static pid_t holder(uid_t user, int sockets, enum how how)
+{
+    int ready[2];
+    char byte;
+    assert_int_equal(pipe(ready), 0);
+    pid_t child = fork();
+    if (child == 0) {
+        if (user != geteuid() && setresuid(user, user, user) != 0)
+            _exit(1);
+        prctl(PR_SET_PDEATHSIG, SIGKILL);
+        for (int i = 0; i < sockets; i++) {
+            socklen_t length;
+            struct sockaddr_un name = address(i, &length);
+            int fd = socket(AF_UNIX, SOCK_STREAM, 0);
+            if (bind(fd, (struct sockaddr *)&name, length) != 0 || (how != DEAF && listen(fd, 0) != 0))
+                _exit(1);
+            if (how == BUSY && connect(socket(AF_UNIX, SOCK_STREAM, 0), (struct sockaddr *)&name, length) != 0)
+                _exit(1);
+        }
+        (void)!write(ready[1], "", 1);
+        pause();
+    }
+    close(ready[1]);
+    assert_int_equal(read(ready[0], &byte, 1), 1);
+    close(ready[0]);
+    return child;
+}
+
+static void end(pid_t child)
+{
+    kill(child, SIGKILL);
+    waitpid(child, NULL, 0);
+}
+
+static enum claim_result take(bool deaf, bool busy, struct claim *claim)
+{
+    bool root = geteuid() == 0;
+    if (root)
+        assert_int_equal(seteuid(SERVICE), 0);
+    enum claim_result result = claim_take("flotilla", key, deaf, busy, claim);
+    if (root)
+        assert_int_equal(seteuid(0), 0);
+    return result;
+}
+
+/* As a service's user, which root alone can become. Seen to fail while each holder counted. */
+static void passes_over_strangers(void **state)
+{
+    (void)state;
+    static const struct {
+        uid_t user;
+        int sockets;
+        enum how how;
+        bool deaf, busy;
+        enum claim_result result;
+    } cases[] = {
+        {SERVICE, 1, LISTENS, true, false, CLAIM_HELD},
+        {1000, 1, LISTENS, true, false, CLAIM_HELD},
+        {0, 1, LISTENS, true, false, CLAIM_HELD},
+        {APP, 1, LISTENS, false, false, CLAIM_OURS},
+        {912, 2, LISTENS, false, false, CLAIM_OURS}, /* this computer has no group of control tasks */
+        {APP, SOCKETS, LISTENS, false, false, CLAIM_STRANGERS},
+        {APP, 1, DEAF, false, false, CLAIM_DEAF},
+        {APP, 1, DEAF, true, false, CLAIM_OURS},
+        {APP, SOCKETS, DEAF, true, false, CLAIM_STRANGERS},
+        {APP, 1, BUSY, true, false, CLAIM_BUSY},
+        {APP, 1, BUSY, true, true, CLAIM_OURS},
+    };
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0] && geteuid() == 0; i++) {
+        struct claim claim;
+        pid_t child = holder(cases[i].user, cases[i].sockets, cases[i].how);
+        assert_int_equal(take(cases[i].deaf, cases[i].busy, &claim), cases[i].result);
+        if (cases[i].result == CLAIM_HELD)
+            assert_int_equal(claim.process, child);
+        assert_int_equal(claim.fd >= 0, cases[i].result == CLAIM_HELD || cases[i].result == CLAIM_OURS);
+        close(claim.fd);
+        end(child);
+    }
+}
+
+/* Who took a later socket beside a stranger keeps the claim when that goes. Seen to fail where a process looked at no
+ * other socket once it had one. */
+static void one_has_it_when_strangers_go(void **state)
+{
+    (void)state;
+    struct claim first, second;
+    if (geteuid() != 0)
+        return;
+    pid_t stranger = holder(APP, 1, LISTENS);
+    assert_int_equal(take(false, false, &first), CLAIM_OURS);
+    end(stranger);
+    assert_int_equal(take(false, false, &second), CLAIM_HELD);
+    assert_int_equal(second.process, getpid());
+    close(first.fd);
+    struct pollfd gone = {.fd = second.fd};
+    assert_int_equal(poll(&gone, 1, 60 * 1000), 1);
+    close(second.fd);
+    assert_int_equal(take(false, false, &first), CLAIM_OURS);
+    close(first.fd);
+}
+
+int main(void)
+{
+    const struct CMUnitTest all[] = {
+        cmocka_unit_test(passes_over_strangers),
+        cmocka_unit_test(one_has_it_when_strangers_go),
+    };
+    snprintf(key, sizeof key, "claim-%d", (int)getpid());
+    return cmocka_run_group_tests(all, NULL, NULL);
+}
