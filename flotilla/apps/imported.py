@@ -96,7 +96,7 @@ def _unpack(archive: Path, out: Path) -> None:
             for name, source, member in _members(opened):
                 path = PurePosixPath(name.replace("\\", "/"))
                 link = stat.S_ISLNK(member.external_attr >> 16)
-                if path.is_absolute() or ".." in path.parts or ":" in path.parts[0] or link:
+                if not path.parts or path.is_absolute() or ".." in path.parts or ":" in path.parts[0] or link:
                     raise UserError(
                         f"{archive}: {name}: is no file inside the archive; pack it with packNGo(buildInfo)"
                     )

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from flotilla.common import durable, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.processes import bounded
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 
@@ -74,9 +75,10 @@ def fetch(robot: Robot, task: str, out: Path | None = None) -> str:
 
 def _listed(robot: Robot, task: str) -> list[_Remote]:
     """Those that are not empty, by name."""
-    done = subprocess.run(
-        _command(robot, task, _LIST), stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False
-    )
+    try:
+        done = bounded(_command(robot, task, _LIST))
+    except UserError as error:
+        raise UserError(f"{robot.name}: {error}") from None
     _check(robot, done.returncode, done.stderr)
     found = [_Remote(m[3], int(m[1]), m[2]) for line in done.stdout.splitlines() if (m := _LISTED.fullmatch(line))]
     if not found:
@@ -138,13 +140,17 @@ def _append(
         assert process.stdout
         assert process.stderr
         try:
+            left = each.size - begin
             while data := process.stdout.read(_READ_BYTES):
+                left -= len(data)
+                if left < 0:
+                    raise UserError(f"{robot.name}: {each.name}: sends more than it has; look at the robot")
                 write(data)
                 came(len(data))
         except BaseException:
             process.kill()
             raise
-        said = process.stderr.read().decode("utf-8", "replace")
+        said = process.stderr.read(_READ_BYTES).decode("utf-8", "replace")
     if process.returncode == _GONE:
         return False
     _check(robot, process.returncode, said)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import shlex
-import subprocess
 
 from flotilla.common import durable, paths, progress
+from flotilla.common.processes import bounded
+from flotilla.common.text import shown
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
 
@@ -71,15 +72,13 @@ def summary(found: dict[str, tuple[int, str]]) -> str:
 def check(robot: Robot, seconds: int) -> str:
     """Ask the robot, or its guest when one runs; the summary, and where all of it is."""
     with progress.step(f"hardware of {robot.name}, {seconds} s for its latency"):
-        done = subprocess.run(
-            [*ssh.command(robot), "sudo", "sh"], input=script(seconds), capture_output=True, text=True, check=False
-        )
+        done = bounded([*ssh.command(robot), "sudo", "sh"], script(seconds).encode())
     found = parse(done.stdout)
     if done.returncode or found.keys() != CHECKS.keys():
         raise ssh.no_answer(robot, done.stderr.strip() or "it ended in between")
     file = paths.BUILD / "reports" / f"hwcheck-{robot.name}.txt"
     file.parent.mkdir(parents=True, exist_ok=True)
-    text = summary(found)
+    text = shown(summary(found))
     sections = [
         f"== {name}{f' (status {status})' if status else ''}\n{output}" for name, (status, output) in found.items()
     ]

@@ -54,6 +54,12 @@ class Bundle:
         length, size = int(described["chunk_bytes"]), int(described["header"]["BYTES"])
         return sum(min(length, size - number * length) for number in numbers)
 
+    def has(self, numbers: Sequence[int]) -> bool:
+        """Whether there are chunks of these numbers, none twice."""
+        described = json.loads(self.manifest)
+        count = -(-int(described["header"]["BYTES"]) // int(described["chunk_bytes"]))
+        return all(0 <= number < count for number in numbers) and len(set(numbers)) == len(numbers)
+
     def delta(self, told: Mapping[str, Any]) -> Path | None:
         """The delta for a robot that said `told`; None where there is none, or what it lacks is less."""
         file = delta_of(told["base"], self.header["BLOB"])

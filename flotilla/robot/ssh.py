@@ -13,6 +13,8 @@ from pathlib import Path
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.processes import bounded
+from flotilla.common.text import shown
 from flotilla.fleet import keys
 from flotilla.fleet.model import Robot
 
@@ -40,25 +42,31 @@ def shell(robot: Robot, words: Sequence[str] = ()) -> None:
 def command(robot: Robot, *, former: bool = True) -> list[str]:
     """`ssh` to the robot's guest when one runs, else to the robot. `former`: as of `options`."""
     port = forwarded_port(robot)
-    return ["ssh", *options(robot, former=former), *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)])]
+    return [
+        "ssh",
+        "-F",
+        "none",
+        *options(robot, former=former),
+        *(["-p", str(port), "127.0.0.1"] if port else [str(robot.address)]),
+    ]
 
 
 def output(robot: Robot, words: Sequence[str], by: Sequence[str] | None = None) -> str:
-    """What a command on the robot prints, without the last line's end; what it says on stderr, as UserError, when it
-    fails, or when it lasts longer than PATIENCE_S. A program's name before its message is left out. `by`: another
-    way there than `command`'s."""
+    """What a command on the robot prints, without the last line's end, fit for a terminal; what it says on stderr, as
+    UserError, when it fails, or when it lasts longer than PATIENCE_S. A program's name before its message is left out.
+    `by`: another way there than `command`'s."""
     argv = [*(by or command(robot)), shlex.join(words)]
     try:
-        done = subprocess.run(
-            argv, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False, timeout=PATIENCE_S
-        )
+        done = bounded(argv, timeout_s=PATIENCE_S)
+    except UserError as error:
+        raise UserError(f"{robot.name}: {error}: look at the robot") from None
     except subprocess.TimeoutExpired:
         raise no_answer(robot, f"nothing within {PATIENCE_S} s") from None
     if done.returncode == FAILED:
-        raise no_answer(robot, done.stderr.strip())
+        raise no_answer(robot, shown(done.stderr.strip()))
     if done.returncode:
-        raise UserError(f"{robot.name}: {done.stderr.strip().removeprefix(f'{words[0]}: ')}")
-    return done.stdout.rstrip("\n")
+        raise UserError(f"{robot.name}: {shown(done.stderr.strip()).removeprefix(f'{words[0]}: ')}")
+    return shown(done.stdout.rstrip("\n"))
 
 
 def options(robot: Robot, *, former: bool = True) -> list[str]:
@@ -77,6 +85,10 @@ def options(robot: Robot, *, former: bool = True) -> list[str]:
         "HostKeyAlias": robot.name,
         "UserKnownHostsFile": str(known_hosts),
         "GlobalKnownHostsFile": "none",
+        # An agent, a display or a port that is lent to a robot is lent to whoever has taken it over.
+        "ForwardAgent": "no",
+        "ForwardX11": "no",
+        "ClearAllForwardings": "yes",
         # s: where nothing answers, not even a refusal, TCP alone would try for minutes.
         "ConnectTimeout": "20",
     }

@@ -76,9 +76,13 @@ class Access:
         host = "127.0.0.1" if shown.is_unspecified else f"[{shown}]" if shown.version == 6 else str(shown)
         return f"http://{host}:{self._port}/?token={self._token}"
 
-    def set_cookie(self, token: str) -> str:
+    @property
+    def set_cookie(self) -> str:
         """The header that makes the browser send the token from now on."""
-        return f"{self.cookie}={token}; Path=/; HttpOnly; SameSite=Strict"
+        return f"{self.cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self._token.encode())
 
     def check(self, headers: Mapping[str, str], cookie: str, token: str, *, socket: bool) -> None:
         """RefusedError. `token`: of the address; `socket`: a WebSocket is asked for, or something is to be done."""
@@ -91,8 +95,7 @@ class Access:
             raise RefusedError("Origin is another page")
         if socket and origin is None:
             raise RefusedError("a request without Origin")
-        given = [each for each in (cookie, token) if each]
-        if not any(hmac.compare_digest(each.encode(), self._token.encode()) for each in given):
+        if not (self.is_token(cookie) or self.is_token(token)):
             raise RefusedError("no token, or not this program's")
 
     def _is_ours(self, name: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import mmap
 import os
@@ -15,9 +16,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import zstandard
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError
+from lz4.frame import LZ4FrameDecompressor
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -54,7 +57,9 @@ _READ: dict[int, Callable[[ReadDataStream], Any]] = {
 """By what a record is; a message alone has to be told its length."""
 _CHUNK = re.compile(rb"\x06.{8}.{28}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)", re.DOTALL)
 """How a chunk begins; with the length of its content it is one with near certainty."""
-_WRONG = (McapError, struct.error, ValueError, KeyError, RuntimeError, MemoryError, OverflowError)
+_CHUNK_BYTES = 64 << 20
+"""Of a chunk, without compression; `make record` writes 1 MiB."""
+_WRONG = (McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, RuntimeError, MemoryError, OverflowError)
 """What readers of damaged records raise."""
 
 
@@ -160,12 +165,29 @@ def _records(opened: IO[bytes], damage: Damage) -> Iterator[McapRecord]:
                 continue
             record, end = found
             try:
-                yield from breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+                yield from breakup_chunk(_plain(record), validate_crc=True) if isinstance(record, Chunk) else [record]
             except _WRONG:
                 damage.bytes.append((at, end))
             at = end
             if data[at:] == _MAGIC:
                 return
+
+
+def _plain(chunk: Chunk) -> Chunk:
+    """The chunk without compression. ValueError where it has more than it says, or than fits the memory easily."""
+    size = chunk.uncompressed_size
+    if size > _CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size} bytes")
+    if chunk.compression == "lz4":
+        data = LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor(max_window_size=_CHUNK_BYTES).stream_reader(chunk.data) as stream:
+            data = stream.read(size + 1)
+    else:
+        data = chunk.data
+    if len(data) != size:
+        raise ValueError("a chunk of another size than it says")
+    return dataclasses.replace(chunk, compression="", data=data)
 
 
 def _record(data: mmap.mmap, at: int) -> tuple[McapRecord, int] | None:

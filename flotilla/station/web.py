@@ -113,8 +113,9 @@ class Web:
             return web.Response(status=404, text="there is no such file\n", headers=HEADERS)
         kind = _TYPES.get(file.suffix) or mimetypes.guess_type(file.name)[0] or "application/octet-stream"
         headers = dict(HEADERS)
-        if token := request.query.get("token"):  # which is right, or the request would not be here
-            headers["Set-Cookie"] = self._access.set_cookie(token)
+        # Not whatever the address has: a cookie alone brings a request here, too, and would be overwritten.
+        if self._access.is_token(request.query.get("token", "")):
+            headers["Set-Cookie"] = self._access.set_cookie
         return web.Response(
             body=file.read_bytes(),
             content_type=kind,

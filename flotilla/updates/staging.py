@@ -58,15 +58,16 @@ def shipments(lacks: Mapping[str, Lack], by: str, directory: Path | None = None)
     deltas: dict[Path, list[str]] = defaultdict(list)
     chunks: dict[Path, list[str]] = defaultdict(list)
     for name, lack in lacks.items():
-        if lack.anything:
-            delta = release.read(lack.bundle).delta(lack.told)
+        bundle = release.read(lack.bundle)
+        if lack.anything and bundle.has(lack.told["missing"]):  # or it fails alone, when it gets its own copy
+            delta = bundle.delta(lack.told)
             (deltas[delta] if delta else chunks[lack.bundle]).append(name)
     least = {"": 2, "multicast": 1, "ssh": len(lacks) + 1}[by]
     found = [Shipment("delta", delta, tuple(names)) for delta, names in deltas.items() if len(names) >= least]
-    for bundle, names in chunks.items():
+    for path, names in chunks.items():
         if len(names) >= least:
             numbers = sorted({number for name in names for number in lacks[name].told["missing"]})
-            file = _chunks(release.read(bundle), numbers, directory or paths.BUNDLES / "shared")
+            file = _chunks(release.read(path), numbers, directory or paths.BUNDLES / "shared")
             found.append(Shipment("write", file, tuple(names)))
     return found
 

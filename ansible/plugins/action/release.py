@@ -71,6 +71,8 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         told = self._update("begin", bundle.offer)
         if staging.Lack(file, told).anything and not bundle.delta(told) and not self._task.check_mode:
             told = self._update("copy")
+        if not bundle.has(told["missing"]):
+            raise UserError(f"{self._name}: it asks for chunks that the release does not have; look at the robot")
         return {"told": told, "bundle": str(file)}
 
     def _share(self) -> dict[str, Any]:
