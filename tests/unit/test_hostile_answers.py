@@ -48,6 +48,7 @@ def test_an_answer_without_an_end_is_none(
 
 
 def test_a_file_is_no_longer_than_the_robot_says(fleet: Fleet, way: Callable[[str], None]) -> None:
+    """Seen to fail: all was written that came."""
     way("exec yes")
     written: list[bytes] = []
     remote = fetch._Remote("log-000001.rec", 100_000, "")
@@ -86,6 +87,7 @@ def test_ssh_lends_nothing_to_a_robot_and_goes_by_no_configuration_of_the_user(
 
 
 def test_a_member_without_a_name_is_refused(tmp_path: Path) -> None:
+    """Seen to fail: IndexError."""
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr(".", b"")
     with pytest.raises(UserError, match=r"a\.zip: \.: is no file inside the archive"):
@@ -124,6 +126,7 @@ def test_a_small_recording_takes_little_memory(tmp_path: Path, compression: str,
 
 
 def test_the_address_gives_no_other_cookie_than_the_token(page: tuple[int, str]) -> None:
+    """Seen to fail: the cookie became the address's token."""
     port, token = page
     with closing(http.client.HTTPConnection("127.0.0.1", port, 30)) as connection:
         for given, cookie in ((token, f"flotilla-{port}={token}; Path=/; HttpOnly; SameSite=Strict"), ("x", None)):

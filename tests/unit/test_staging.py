@@ -100,6 +100,7 @@ def test_the_station_is_known_by_its_address(fleet: Fleet) -> None:
 
 @pytest.mark.parametrize("missing", [[99], [-1], [1, 1], [1 << 62]])
 def test_a_robot_that_asks_for_what_there_is_not_holds_up_no_other(bundle: Path, missing: list[int]) -> None:
+    """Seen to fail: ValueError for all, by a number that the bundle does not have."""
     lacks = {"robot1": lack(bundle, 1, 2), "robot2": lack(bundle, 2, 7), "robot3": lack(bundle, *missing)}
     (shared,) = staging.shipments(lacks, "")
     assert shared.robots == ("robot1", "robot2")
