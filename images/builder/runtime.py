@@ -151,7 +151,9 @@ def check_plugins(directory: Path, system: System) -> list[dict[str, Any]]:
     try:
         listing: list[dict[str, Any]] = json.loads(done.stdout)
     except ValueError as error:  # a plug-in may write there, too
-        raise UserError(f"the list of blocks is not JSON: {error}; plug-ins must not write to standard output") from None
+        raise UserError(
+            f"the list of blocks is not JSON: {error}; plug-ins must not write to standard output"
+        ) from None
     return listing
 
 

@@ -53,7 +53,7 @@ def listed(flotilla_run: Path, directory: Path, text: str, flag: str) -> subproc
 def test_a_new_block_gets_what_it_declares(
     flotilla_run: Path, tmp_path: Path, flag: str, can: bool, camera: bool, ports: bool
 ) -> None:
-    """Seen to fail: the names of the runtime's own blocks decided, so each of these was denied what it needs."""
+    """Before, names of the runtime's own blocks decided."""
     listing: list[dict[str, Any]] = json.loads(listed(flotilla_run, tmp_path, BLOCK, flag).stdout)
     needs = privileges.needs_of(listing)
     lines = privileges.user(0, TASK, needs).splitlines()

@@ -14,8 +14,7 @@ from flotilla.reference.pages import RUNTIME_PAGES
 
 @pytest.mark.parametrize("path", RUNTIME_PAGES, ids=lambda path: path.name)
 def test_page_is_the_sources(flotilla_run: Path, path: Path) -> None:
-    """Seen to fail with another default of the key `overruns`, with another summary and header of the block pid, and
-    with a block that lost its FL_CAN_INTERFACE."""
+    """Seen to fail with another default of the key `overruns`, and with another summary and header of the block pid."""
     made = RUNTIME_PAGES[path](flotilla_run.parent)
     assert path.read_text(encoding="utf-8") == made, "run `make reference` and commit the page"
 
