@@ -96,7 +96,7 @@ def test_a_plugin_that_is_checked_reaches_nothing(
 ) -> None:
     """Seen to fail: `has read the key of a release`, `wrote a file`, `reached the network`, `changed its root`."""
     directory, task = plugins(crash), b"period: 10 ms\nblocks:\n  a: {type: attack}\n"
-    checks = {
+    checks: dict[str, Callable[[], object]] = {
         "plug-in": lambda: runtime.check_plugins(directory, HOST),
         "task": lambda: runtime.check_task(tmp_path / "task.yml", task, directory, HOST),
     }

@@ -167,8 +167,9 @@ def test_manifest_and_bills_name_the_apps(fleet: Fleet, hover: BuiltApp, tmp_pat
     image = tmp_path / "robot4.img"
     part = manifest.Part(name="some", bytes=1, sha256="0")
     manifest.write(
-        fleet, fleet.robots[4], (read_lock("smartcoret3"), read_lock("tools")), tmp_path, board_inputs="0", nodes=[],
-        apps=[hover], source="no git", data=part, image=part, extents=[], beside=image,
+        fleet, fleet.robots[4], (read_lock("smartcoret3"), read_lock("tools")), tmp_path, board_inputs="0",
+        nodes=[Node(PurePosixPath("/A/etc/machine-id"), b"%032x\n" % 1)],
+        apps=[hover], source="no git", boot_loader=part, data=part, image=part, extents=[], beside=image,
     )  # fmt: skip
     (told,) = manifest.read(image, "make image").apps
     assert (told.name, told.version, told.sha256) == ("hover", hover.version, hover.sha256)

@@ -307,20 +307,15 @@ static void *start(void *block)
     return (void *)(intptr_t)((struct fl_block *)block)->type->start(block);
 }
 
-/* Whether somebody waits for a lock that this process holds on `file`. */
-static bool is_awaited(const struct stat *file)
+/* How many descriptors of this process are open on `file`. */
+static int descriptors(const struct stat *file)
 {
-    char line[256];
-    bool found = false;
-    FILE *locks = fopen("/proc/locks", "re");
-    assert_non_null(locks);
-    while (fgets(line, sizeof line, locks)) {
-        unsigned long inode;
-        if (sscanf(line, "%*u: -> OFDLCK ADVISORY WRITE %*d %*x:%*x:%lu", &inode) == 1 && inode == file->st_ino)
-            found = true;
-    }
-    fclose(locks);
-    return found;
+    enum { DESCRIPTORS = 1024 };
+    struct stat found;
+    int count = 0;
+    for (int fd = 0; fd < DESCRIPTORS; fd++)
+        count += fstat(fd, &found) == 0 && found.st_dev == file->st_dev && found.st_ino == file->st_ino;
+    return count;
 }
 
 /* Between opening a queue and locking it its last user removes it: the block must make another, or it would send into
@@ -337,7 +332,7 @@ static void makes_anew_what_is_being_removed(void **state)
     assert_int_equal(fstat(removed, &file), 0);
     assert_int_equal(fcntl(removed, F_OFD_SETLK, &change), 0);
     assert_int_equal(pthread_create(&thread, NULL, start, send), 0);
-    while (!is_awaited(&file))
+    while (descriptors(&file) < 2) /* the block has opened it, and cannot lock it yet */
         sched_yield();
     mq_unlink(name);
     mq_close(removed);
