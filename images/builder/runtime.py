@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from flotilla.common import cache, namespace, paths, progress, sandbox, sources, together
 from flotilla.common.errors import UserError
@@ -202,10 +202,15 @@ def _run(system: System, needed: Sequence[Path], program: str, *arguments: str) 
         [*argv, *arguments], readable=[tree, programs, *needed], environment=environment, seconds=_CHECK_SECONDS,
         file_bytes=_CHECK_BYTES,
     )  # fmt: skip
-    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as said:  # to which the limit applies
-        done = subprocess.run(sandboxed, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=said, check=False)
-        said.seek(0)
-        return subprocess.CompletedProcess(done.args, done.returncode, stderr=said.read())
+    # Into files, to which the limit applies.
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as said:
+        done = subprocess.run(sandboxed, stdin=subprocess.DEVNULL, stdout=output, stderr=said, check=False)
+        return subprocess.CompletedProcess(done.args, done.returncode, _content(output), _content(said))
+
+
+def _content(file: BinaryIO) -> str:
+    file.seek(0)
+    return file.read().decode(errors="replace")
 
 
 def source_files() -> list[Path]:
