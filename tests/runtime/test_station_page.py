@@ -38,7 +38,7 @@ from tests.station_page import Station, WheeledRobot, connected, until
 
 WHEELED = Path("lab/wheeled/inventory")
 SSH = """#!/bin/sh
-while [ "$1" = -o ]; do shift 2; done
+while [ "$1" = -o ] || [ "$1" = -F ]; do shift 2; done
 shift
 PATH="{directory}:$PATH" exec sh -c "$*"
 """

@@ -22,7 +22,7 @@ ROBOT = Robot(
     name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"), control_tasks=["valves", "sensors"]
 )
 SSH = """#!/bin/sh
-while [ "$1" = -o ]; do shift 2; done
+while [ "$1" = -o ] || [ "$1" = -F ]; do shift 2; done
 PATH="{directory}:$PATH" exec sh -c "$*"
 """
 
