@@ -40,7 +40,7 @@ def test_an_integrator_takes_input_and_reset_from_one_source(tasks: Tasks, every
     high → sum", though `in` of the step before closes no loop."""
     text = task(
         f"""
-sum: {{type: integrator, every: {every}, in: {{in: ramp.out, reset: high.out}}, parameters: {{initial: 5}}}}
+sum: {{type: integrator, every: {every}, in: {{in: ramp.out, reset: high.on}}, parameters: {{initial: 5}}}}
 ramp: {{type: sum, in: {{in0: before.out, in1: 1}}, parameters: {{signs: "++"}}}}
 before: {{type: delay, in: {{in: ramp.out}}}}
 signed: {{type: gain, in: {{in: ramp.out}}, parameters: {{factor: {sign}}}}}

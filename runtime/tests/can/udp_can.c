@@ -132,7 +132,7 @@ int setsockopt(int fd, int level, int option, const void *value, socklen_t size)
 }
 
 /* An abstract Unix address says which bus it is about: others may run beside this one. */
-static int udp_can_bind_other(int fd, const struct sockaddr *address, socklen_t size)
+static int udp_can_named(const char *call, int fd, const struct sockaddr *address, socklen_t size)
 {
     const char *hub = getenv("CAN_HUB");
     struct sockaddr_un named;
@@ -144,14 +144,19 @@ static int udp_can_bind_other(int fd, const struct sockaddr *address, socklen_t 
             size += (socklen_t)strlen(hub);
         }
     }
-    return ((int (*)(int, const struct sockaddr *, socklen_t))(uintptr_t)udp_can_real("bind"))(fd, address, size);
+    return ((int (*)(int, const struct sockaddr *, socklen_t))(uintptr_t)udp_can_real(call))(fd, address, size);
+}
+
+int connect(int fd, const struct sockaddr *address, socklen_t size)
+{
+    return udp_can_named("connect", fd, address, size);
 }
 
 int bind(int fd, const struct sockaddr *address, socklen_t size)
 {
     struct udp_can *can = udp_can_of(fd);
     if (!can)
-        return udp_can_bind_other(fd, address, size);
+        return udp_can_named("bind", fd, address, size);
     const struct sockaddr_can *asked = (const struct sockaddr_can *)(const void *)address;
     struct sockaddr_in hub = {.sin_family = AF_INET,
                               .sin_port = htons((uint16_t)atoi(getenv("CAN_HUB"))),
