@@ -8,12 +8,19 @@
 #include <time.h>
 #include <unistd.h>
 
+#ifdef SYS_clock_nanosleep_time64 /* times have 64 bits on robots of 32 bits, too */
+#define SLEEP SYS_clock_nanosleep_time64
+#else
+#define SLEEP SYS_clock_nanosleep
+#endif
+_Static_assert(sizeof(time_t) == 8, "compile it with _TIME_BITS=64");
+
 enum { BUSY_NS = 11 * 1000 * 1000, SECOND_NS = 1000 * 1000 * 1000 };
 
 __attribute__((visibility("default"))) int clock_nanosleep(clockid_t clock, int flags, const struct timespec *until,
                                                            struct timespec *left)
 {
-    if (syscall(SYS_clock_nanosleep, clock, flags, until, left) < 0)
+    if (syscall(SLEEP, clock, flags, until, left) < 0)
         return errno;
     static _Thread_local unsigned sleeps;
     if (!(flags & TIMER_ABSTIME) || sched_getscheduler(0) != SCHED_FIFO || ++sleeps % 2)
