@@ -227,7 +227,7 @@ def test_tasks_take_other_keys(guests: Guests) -> None:
 @pytest.mark.nightly
 def test_a_robot_that_dies_stops_the_roll_out_and_nothing_is_half_done(guests: Guests) -> None:
     for name in guests.robots:
-        guests.sudo(name, "echo 10.42.0.99 stranger >>/etc/hosts; sysctl -q kernel.panic=0")
+        guests.sudo(name, "echo 10.42.0.99 stranger >>/etc/hosts; sysctl -q kernel.panic_on_oops=0")
     argv = guests.argv("-e", json.dumps({"waves": [1, 1]}))
     with subprocess.Popen(
         argv, cwd=ANSIBLE, env=ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -249,7 +249,7 @@ def test_a_robot_that_dies_stops_the_roll_out_and_nothing_is_half_done(guests: G
     assert completed.outcomes() | {"robot1": ""} == {"robot1": "", "robot2": "changed"}
     for name in guests.robots:
         assert guests.sudo(name, "grep -c stranger /etc/hosts || true").strip() == "0"
-        assert guests.sudo(name, "cat /proc/sys/kernel/panic").strip() == "10"
+        assert guests.sudo(name, "cat /proc/sys/kernel/panic_on_oops").strip() == "1"
 
 
 @pytest.mark.nightly

@@ -29,7 +29,7 @@ DRIFT = {
     "echo 10.42.0.99 stranger >>/etc/hosts": "/etc/hosts has another content",
     "rm /etc/chrony/chrony.conf": "/etc/chrony/chrony.conf is missing",
     "rm -r /etc/systemd/system/multi-user.target.wants": "multi-user.target.wants was removed",
-    "sysctl -q kernel.panic=0": "kernel.panic = 0, not 10",
+    "sysctl -q kernel.panic_on_oops=0": "kernel.panic_on_oops = 0, not 1",
     "systemctl stop nftables": "nftables.service does not run",
 }
 """What drifts on robot 2, and how the report names it."""

@@ -55,8 +55,8 @@ FAULTS = {
         "description: firewall: the rules in force are others",
     ),
     "another setting of the kernel": (
-        "sysctl -q kernel.panic=0", "sysctl -q kernel.panic=10",
-        "description: realtime: kernel.panic = 0, not 10",
+        "sysctl -q kernel.panic_on_oops=0", "sysctl -q kernel.panic_on_oops=1",
+        "description: realtime: kernel.panic_on_oops = 0, not 1",
     ),
     "a battery that is flat": (
         "hwclock --noadjfile --utc --set --date '2001-01-01 00:00:00'", "hwclock --noadjfile --utc --systohc",
