@@ -11,7 +11,7 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet
-from images.builder import compare
+from images.builder import card, compare
 from images.builder.build import build
 
 ROBOT = 3
@@ -47,9 +47,13 @@ def test_planted_difference_fails_and_is_named() -> None:
     KEPT.unlink()
 
 
-def test_robots_of_a_board_differ_in_the_data_partition_only(fleet: Fleet) -> None:
+def test_robots_of_a_board_differ_in_identifier_and_data_partition_only(fleet: Fleet) -> None:
+    """The identifier has four bytes of the MBR."""
     one, other = build(fleet, [fleet.robots[number] for number in (3, 4)])
-    assert [difference.part.name for difference in compare.differing_parts(one, other)] == ["data partition"]
+    assert [difference.part.name for difference in compare.differing_parts(one, other)] == ["MBR", "data partition"]
+    with one.open("rb") as first, other.open("rb") as second:
+        mine, others = first.read(card.SECTOR), second.read(card.SECTOR)
+    assert mine[:440] + mine[444:] == others[:440] + others[444:]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="the account is made for root's second build only")

@@ -1,16 +1,12 @@
 #define _GNU_SOURCE
-#include "testbed.h"
-
+#include "child.h"
 #include "core/claim.h"
 
 #include <poll.h>
-#include <signal.h>
 #include <stddef.h>
 #include <stdio.h>
-#include <sys/prctl.h>
 #include <sys/socket.h>
 #include <sys/un.h>
-#include <sys/wait.h>
 #include <unistd.h>
 
 enum { SERVICE = 911, APP = 902, SOCKETS = 8 };
@@ -27,39 +23,29 @@ static struct sockaddr_un address(int number, socklen_t *length)
     return found;
 }
 
+struct held {
+    int sockets;
+    enum how how;
+};
+
+static void hold(void *context)
+{
+    const struct held *held = context;
+    for (int i = 0; i < held->sockets; i++) {
+        socklen_t length;
+        struct sockaddr_un name = address(i, &length);
+        int fd = socket(AF_UNIX, SOCK_STREAM, 0);
+        if (bind(fd, (struct sockaddr *)&name, length) != 0 || (held->how != DEAF && listen(fd, 0) != 0))
+            _exit(1);
+        if (held->how == BUSY && connect(socket(AF_UNIX, SOCK_STREAM, 0), (struct sockaddr *)&name, length) != 0)
+            _exit(1);
+    }
+}
+
 /* A process of a user that holds the first sockets of the name until it is killed. */
 static pid_t holder(uid_t user, int sockets, enum how how)
 {
-    int ready[2];
-    char byte;
-    assert_int_equal(pipe(ready), 0);
-    pid_t child = fork();
-    if (child == 0) {
-        if (user != geteuid() && setresuid(user, user, user) != 0)
-            _exit(1);
-        prctl(PR_SET_PDEATHSIG, SIGKILL);
-        for (int i = 0; i < sockets; i++) {
-            socklen_t length;
-            struct sockaddr_un name = address(i, &length);
-            int fd = socket(AF_UNIX, SOCK_STREAM, 0);
-            if (bind(fd, (struct sockaddr *)&name, length) != 0 || (how != DEAF && listen(fd, 0) != 0))
-                _exit(1);
-            if (how == BUSY && connect(socket(AF_UNIX, SOCK_STREAM, 0), (struct sockaddr *)&name, length) != 0)
-                _exit(1);
-        }
-        (void)!write(ready[1], "", 1);
-        pause();
-    }
-    close(ready[1]);
-    assert_int_equal(read(ready[0], &byte, 1), 1);
-    close(ready[0]);
-    return child;
-}
-
-static void end(pid_t child)
-{
-    kill(child, SIGKILL);
-    waitpid(child, NULL, 0);
+    return child_begin(user, hold, &(struct held){sockets, how});
 }
 
 static enum claim_result take(bool deaf, bool busy, struct claim *claim)
@@ -104,7 +90,7 @@ static void passes_over_strangers(void **state)
             assert_int_equal(claim.process, child);
         assert_int_equal(claim.fd >= 0, cases[i].result == CLAIM_HELD || cases[i].result == CLAIM_OURS);
         close(claim.fd);
-        end(child);
+        child_end(child);
     }
 }
 
@@ -115,10 +101,10 @@ static void one_has_it_when_strangers_go(void **state)
     (void)state;
     struct claim first, second;
     if (geteuid() != 0)
-        return;
+        skip();
     pid_t stranger = holder(APP, 1, LISTENS);
     assert_int_equal(take(false, false, &first), CLAIM_OURS);
-    end(stranger);
+    child_end(stranger);
     assert_int_equal(take(false, false, &second), CLAIM_HELD);
     assert_int_equal(second.process, getpid());
     close(first.fd);

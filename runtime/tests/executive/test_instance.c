@@ -1,46 +1,37 @@
 #define _GNU_SOURCE
-#include "testbed.h"
-
+#include "child.h"
 #include "executive/instance.h"
 
 #include <fcntl.h>
-#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <sys/file.h>
 #include <sys/prctl.h>
 #include <sys/stat.h>
-#include <sys/wait.h>
 #include <unistd.h>
 
 static char path[] = "/tmp/flotilla-instance-XXXXXX";
 
+struct lock {
+    int fd, operation;
+};
+
+static void hold(void *context)
+{
+    const struct lock *lock = context;
+    if (flock(lock->fd, lock->operation) != 0)
+        _exit(1);
+    prctl(PR_SET_DUMPABLE, 0); /* most of its files in /proc belong to root then */
+}
+
 /* A process of a user that holds a lock on the file until it is killed. */
 static pid_t locked_by(uid_t user, int operation)
 {
-    int ready[2];
-    char byte;
-    assert_int_equal(pipe(ready), 0);
-    pid_t child = fork();
-    if (child == 0) {
-        int fd = open(path, O_RDONLY);
-        if (fd < 0 || (user != geteuid() && setresuid(user, user, user) != 0) || flock(fd, operation) != 0)
-            _exit(1);
-        prctl(PR_SET_PDEATHSIG, SIGKILL);
-        prctl(PR_SET_DUMPABLE, 0); /* most of its files in /proc belong to root then */
-        (void)!write(ready[1], "", 1);
-        pause();
-    }
-    close(ready[1]);
-    assert_int_equal(read(ready[0], &byte, 1), 1);
-    close(ready[0]);
+    struct lock lock = {open(path, O_RDONLY), operation}; /* here, because the user may not open it */
+    assert_true(lock.fd >= 0);
+    pid_t child = child_begin(user, hold, &lock);
+    close(lock.fd);
     return child;
-}
-
-static void end(pid_t child)
-{
-    kill(child, SIGKILL);
-    waitpid(child, NULL, 0);
 }
 
 static void names_who_runs_it(void **state)
@@ -50,7 +41,7 @@ static void names_who_runs_it(void **state)
     for (size_t i = 0; i < (geteuid() == 0 ? 3 : 1); i++) {
         pid_t child = locked_by(users[i], LOCK_EX);
         assert_int_equal(instance_lock(path), child);
-        end(child);
+        child_end(child);
     }
 }
 
@@ -71,7 +62,7 @@ static void heeds_no_lock_of_others_as_a_service(void **state)
         int process = instance_lock(path);
         assert_int_equal(seteuid(0), 0);
         assert_int_equal(process, cases[i].heeded ? child : 0);
-        end(child);
+        child_end(child);
     }
 }
 
