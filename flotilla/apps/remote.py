@@ -25,7 +25,7 @@ import pydantic
 from flotilla.apps import app, fmu
 from flotilla.common import durable, namespace, paths, progress, text
 from flotilla.common.errors import UserError
-from flotilla.common.processes import DIE_WITH_PARENT
+from flotilla.common.processes import DIE_WITH_PARENT, content, limited
 from flotilla.fleet import apps
 from flotilla.fleet.model import Board, Robot
 from flotilla.robot import ssh
@@ -65,7 +65,7 @@ class Connection:
     def run(self, command: str, name: str, *arguments: str, stdin: bytes = b"") -> str:
         """Run it; what it says. UserError with the reason when it refuses or the robot does not answer."""
         with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as failure:
-            argv = [*_limited(_ANSWER_BYTES), *self.argv(command, name, *arguments)]
+            argv = [*limited(_ANSWER_BYTES), *self.argv(command, name, *arguments)]
             with _started(argv, output, failure) as process:
                 try:
                     process.communicate(stdin)
@@ -73,12 +73,12 @@ class Connection:
                     process.kill()
                     raise
             if process.returncode:
-                raise self.error(process.returncode, _content(failure))
-            return _content(output)
+                raise self.error(process.returncode, content(failure))
+            return content(output)
 
     def stream(self, command: str, name: str, *arguments: str, stdin: Path, stdout: Path, log: Path) -> None:
         """Run it between two files; what it says besides is shown as it comes, and kept in `log`."""
-        argv = [*DIE_WITH_PARENT, *_limited(MADE_BYTES), *self.argv(command, name, *arguments)]
+        argv = [*DIE_WITH_PARENT, *limited(MADE_BYTES), *self.argv(command, name, *arguments)]
         last = failed = ""
         left = _ANSWER_BYTES
         with stdin.open("rb") as given, stdout.open("wb") as made, log.open("w") as kept:
@@ -118,18 +118,8 @@ class Connection:
         return ssh.no_answer(self.robot, message or "the connection broke")
 
 
-def _limited(most: int) -> list[str]:
-    """Prefix of a command that ends when it has written so much into a file."""
-    return ["prlimit", f"--fsize={most}", "--"]
-
-
 def _lines(stream: IO[str]) -> Iterator[str]:
     return iter(lambda: stream.readline(_LINE), "")
-
-
-def _content(file: BinaryIO) -> str:
-    file.seek(0)
-    return file.read().decode(errors="replace")
 
 
 def _started(argv: Sequence[str], output: BinaryIO, failure: BinaryIO) -> subprocess.Popen[bytes]:

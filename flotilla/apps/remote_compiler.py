@@ -16,6 +16,7 @@ from pathlib import Path
 from flotilla.apps import remote
 from flotilla.common import cache, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.processes import limited
 from images.builder import pool, tools
 from images.builder.chroot import Chroot
 from images.builder.lock import Lock, read_lock
@@ -67,9 +68,8 @@ class Compiler:
             # tar, which keeps what it unpacks inside: the other end may be anybody's by now. Whoever reads what was
             # made follows no link that leads out of `work`: images.builder.runtime.command refuses these.
             unpack = ["tar", "-x", "--no-same-owner", "--no-same-permissions", "-f", str(made), "-C", str(work)]
-            done = subprocess.run(
-                ["prlimit", f"--fsize={remote.MADE_BYTES}", "--", *unpack], capture_output=True, text=True, check=False
-            )
+            argv = [*limited(remote.MADE_BYTES), *unpack]
+            done = subprocess.run(argv, capture_output=True, text=True, check=False)
         if done.returncode:
             raise UserError(f"{self._to.robot.name}: what it compiled is no archive: {done.stderr.strip()[:500]}")
 

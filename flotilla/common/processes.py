@@ -6,6 +6,7 @@ import os
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from typing import BinaryIO
 
 from flotilla.common.errors import UserError
 
@@ -13,6 +14,17 @@ DIE_WITH_PARENT = ["setpriv", "--pdeathsig", "KILL"]
 """Prefix of a command that must not outlive the thread that starts it, however that ends."""
 ANSWER_BYTES = 16 << 20
 """Of what a program on a robot may write, where nobody says otherwise: the longest true answers have one."""
+
+
+def limited(most_bytes: int) -> list[str]:
+    """Prefix of a command that is ended, by SIGXFSZ, where it writes so much into a file."""
+    return ["prlimit", f"--fsize={most_bytes}", "--"]
+
+
+def content(file: BinaryIO) -> str:
+    """All of a file that a program has written to."""
+    file.seek(0)
+    return file.read().decode("utf-8", "replace")
 
 
 def bounded(
@@ -25,11 +37,9 @@ def bounded(
     with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         given.write(stdin)
         given.seek(0)
-        limited = ["prlimit", f"--fsize={ANSWER_BYTES}", "--", *argv]
-        done = subprocess.run(limited, stdin=given, stdout=out, stderr=err, check=False, timeout=timeout_s)
+        done = subprocess.run(
+            [*limited(ANSWER_BYTES), *argv], stdin=given, stdout=out, stderr=err, check=False, timeout=timeout_s
+        )
         if max(out.seek(0, os.SEEK_END), err.seek(0, os.SEEK_END)) >= ANSWER_BYTES:
             raise UserError(f"an answer of more than {ANSWER_BYTES >> 20} MiB; nothing was done with it")
-        out.seek(0)
-        err.seek(0)
-        said, complained = (stream.read().decode("utf-8", "replace") for stream in (out, err))
-        return subprocess.CompletedProcess(argv, done.returncode, said, complained)
+        return subprocess.CompletedProcess(argv, done.returncode, content(out), content(err))

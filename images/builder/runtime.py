@@ -11,10 +11,11 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from flotilla.common import cache, namespace, paths, progress, sandbox, sources, together
 from flotilla.common.errors import UserError
+from flotilla.common.processes import content
 from flotilla.fleet.model import System
 from images.builder import chroot, pool, runtime_stage, toolchain, tools
 from images.builder.lock import HOST, Lock, read_lock, runtime_lock
@@ -205,12 +206,7 @@ def _run(system: System, needed: Sequence[Path], program: str, *arguments: str) 
     # Into files, to which the limit applies.
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as said:
         done = subprocess.run(sandboxed, stdin=subprocess.DEVNULL, stdout=output, stderr=said, check=False)
-        return subprocess.CompletedProcess(done.args, done.returncode, _content(output), _content(said))
-
-
-def _content(file: BinaryIO) -> str:
-    file.seek(0)
-    return file.read().decode(errors="replace")
+        return subprocess.CompletedProcess(done.args, done.returncode, content(output), content(said))
 
 
 def source_files() -> list[Path]:
