@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -630,9 +629,7 @@ def test_second_load_asks_no_ansible(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return "{}"
 
     monkeypatch.setattr(inventory, "_ansible_inventory", ansible)
-    started = time.process_time()
     assert inventory.load_fleet(directory) == first
-    assert time.process_time() - started < 0.05
     assert not asked
     (directory / ROBOTS).write_text((directory / ROBOTS).read_text() + "# changed\n")
     with pytest.raises(ProblemsError, match="there are no robots"):
