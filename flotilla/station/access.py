@@ -82,7 +82,7 @@ class Access:
         return f"{self.cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
 
     def is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._token.encode())
+        return hmac.compare_digest(given.encode(errors="surrogateescape"), self._token.encode())
 
     def check(self, headers: Mapping[str, str], cookie: str, token: str, *, socket: bool) -> None:
         """RefusedError. `token`: of the address; `socket`: a WebSocket is asked for, or something is to be done."""

@@ -1,15 +1,14 @@
 """Who may hold a connection to the station's page: whoever has the token, and others for a moment.
 
 Connections cost files, of which a process has so many. Those that have not shown the token are few for each address and
-in all, and end after PROVE_S. A new one ends the oldest such one of the address that has most: so whoever holds
-connections holds up itself first, and a browser's Stop all, whose connection may be new, gets in.
+in all, and end after PROVE_S. A new one ends the oldest, of its address or of all: so whoever holds connections holds
+up itself first, and a browser's Stop all, whose connection may be new, gets in.
 """
 
 from __future__ import annotations
 
 import asyncio
 import resource
-from collections import Counter
 from collections.abc import Callable
 
 PROVE_S = 5.0
@@ -34,12 +33,12 @@ class Admission:
     def come(self, transport: asyncio.BaseTransport) -> None:
         address = str((transport.get_extra_info("peername") or ("?",))[0])
         self._unproven[transport] = address
-        counts = Counter(self._unproven.values())
-        if counts[address] > OF_AN_ADDRESS:
-            self._end(address)
+        of_address = [each for each, whose in self._unproven.items() if whose == address]
+        if len(of_address) > OF_AN_ADDRESS:
+            self._end(of_address[0])
         elif len(self._unproven) > IN_ALL:
-            self._end(counts.most_common(1)[0][0])
-        asyncio.get_running_loop().call_later(PROVE_S, self._late, transport)
+            self._end(next(iter(self._unproven)))
+        asyncio.get_running_loop().call_later(PROVE_S, self._end, transport)
 
     def proven(self, transport: asyncio.BaseTransport | None) -> None:
         """It has shown the token."""
@@ -48,19 +47,12 @@ class Admission:
     def gone(self, transport: asyncio.BaseTransport) -> None:
         self._unproven.pop(transport, None)
 
-    def _late(self, transport: asyncio.BaseTransport) -> None:
+    def _end(self, transport: asyncio.BaseTransport) -> None:
+        """If it has not shown the token, and is there."""
         if address := self._unproven.pop(transport, ""):
-            self._abort(transport, address)
-
-    def _end(self, address: str) -> None:
-        """The oldest of an address."""
-        oldest = next(each for each, whose in self._unproven.items() if whose == address)
-        self._abort(oldest, self._unproven.pop(oldest))
-
-    def _abort(self, transport: asyncio.BaseTransport, address: str) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        transport.abort()
-        self._note(address)
+            assert isinstance(transport, asyncio.Transport)
+            transport.abort()
+            self._note(address)
 
 
 class Door(asyncio.Protocol):

@@ -137,7 +137,9 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
     options = [word for setting in _SETTINGS for word in ("-o", setting)]
     argv = [*DIE_WITH_PARENT, program, *options, *shared, *way, shlex.join(["sudo", "sh", "-c", script])]
     pipe = subprocess.PIPE
-    with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True) as process:
+    with subprocess.Popen(
+        argv, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True, encoding="utf-8", errors="replace"
+    ) as process:
         try:
             assert process.stdout
             assert process.stderr
@@ -263,7 +265,7 @@ class Services:
                     for task, state in answer.tasks.items():
                         self.states[robot.name, task] = state
                     self.notes[robot.name] = answer.notes
-            except UserError:
+            except (UserError, OSError):  # such as too many open files
                 for task in robot.control_tasks:
                     self.states[robot.name, task] = State("no answer", False)
             time.sleep(ASK_S)

@@ -26,8 +26,8 @@ BROWSERS = 16
 """At once."""
 _HEARTBEAT_S = 4.0
 _CLOSE_S = 2.0
-_BACKLOG = 1024
-"""Connections that the kernel keeps until they are accepted; more than an address may hold."""
+_BACKLOG = 64
+"""Connections that the kernel keeps until they are accepted, which is all of them at once: fewer than files."""
 _NOTE_EVERY_S = 1.0
 _TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
 

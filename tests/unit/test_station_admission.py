@@ -59,6 +59,20 @@ def idle(port: int, stack: ExitStack, count: int, source: str) -> list[socket.so
     ]  # fmt: skip
 
 
+def test_many_addresses_end_their_own_connections_first(page: tuple[int, str]) -> None:
+    """Seen to fail where the address that had most lost one: an operator's browser has two at once."""
+    port, token = page
+    with ExitStack() as stack:
+        for number in range(admission.IN_ALL):
+            idle(port, stack, 1, f"127.0.1.{number + 1}")
+        first, second = idle(port, stack, 2, "127.0.2.1")
+        for number in range(20):
+            idle(port, stack, 1, f"127.0.3.{number + 1}")
+        for connection in (first, second):
+            connection.sendall(f"GET /?token={token} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
+            assert connection.recv(12) == b"HTTP/1.1 200"
+
+
 def stop_all(port: int, token: str, source: str) -> tuple[int, bytes]:
     """By a connection of its own."""
     cookie = f"flotilla-{port}={token}"

@@ -102,6 +102,14 @@ def test_addresses_that_are_this_page(address: str, host: str, good: bool) -> No
             access.check(headers, "", token, socket=True)
 
 
+def test_a_cookie_that_is_no_text_is_no_token() -> None:
+    """Seen to fail: it ended in a traceback, for each request."""
+    access = Access("127.0.0.1", 8080)
+    headers = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
+    with pytest.raises(RefusedError, match="no token"):
+        access.check(headers, "\udcff", "", socket=True)
+
+
 def test_rows_come_no_faster_than_a_screen_shows() -> None:
     assert [watching.every(period_s) for period_s in (None, 0.001, 0.01, 0.1, 0.004)] == [10, 10, 1, 1, 3]
     for period_s in (0.0003, 0.002, 0.003, 0.007):
@@ -120,7 +128,7 @@ def test_a_pose_a_path_and_a_scan() -> None:
     for x in (0.0, 0.01, 0.5, math.nan):
         receiver.hand(known["drive"], drive | {"pose": (x, 0.25, 1.0), "alive": True}, 10**9)
     ranges = [math.nan] * 171
-    ranges[85] = 1.0
+    ranges[84], ranges[85] = -math.inf, 1.0  # the former is too near
     receiver.hand(known["perceive"], {"step": 1, "age": 0.0, "ranges": tuple(ranges), "good": True}, 10**9)
     state = view.state()
     assert state["poses"] == {"rover": (0.5, 0.25, 1.0)}
