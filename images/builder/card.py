@@ -28,7 +28,7 @@ import tarfile
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, NamedTuple
 
 import pydantic
@@ -105,8 +105,8 @@ def guid(disk_id: int, number: int) -> str:
 def disk_id(nodes: list[Node]) -> int:
     """The identifier of a robot's card, 32 bits in the MBR or the beginning of each GUID in the GPT: the beginning of
     the robot's machine ID."""
-    (machine_id,) = (node.content for node in nodes if node.path.name == "machine-id" and node.content)
-    return int(machine_id[:8], 16) or 1  # 0: no identifier, for the kernel
+    (machine_id,) = (node.content for node in nodes if node.path == _MACHINE_ID)
+    return int(machine_id or b"", 16) >> 96 or 1  # 0: no identifier, for the kernel
 
 
 REGION = 4 * MIB
@@ -143,6 +143,8 @@ _GPT_TYPES = {"system": "C12A7328-F81F-11D2-BA4B-00A0C93EC93B"} | dict.fromkeys(
     _TYPES, "0FC63DAF-8483-4772-8E79-3D69D8477DE4"
 )
 """Of partitions, in a GPT: UEFI's system partition, and data of Linux, which no other system touches."""
+_MACHINE_ID = PurePosixPath("/A/etc/machine-id")
+"""In the data partition: 32 hexadecimal digits."""
 _MBR_ID = 440
 """Where the identifier lies in an MBR."""
 _GPT_HEAD, _GPT_TAIL = 34 * 512, MIB

@@ -69,7 +69,7 @@ LOCK = Lock(
 NODES = [
     Node(PurePosixPath("/etc")),
     Node(PurePosixPath("/etc/hostname"), b"robot3\n", 0o644),
-    Node(PurePosixPath("/etc/machine-id"), b"%032x\n" % (0xF1 << 96), 0o644),
+    Node(PurePosixPath("/A/etc/machine-id"), b"%032x\n" % (0xF1 << 96), 0o644),
 ]
 
 
