@@ -74,7 +74,7 @@ static int hold(const struct sockaddr_un *address, socklen_t length)
     return -1;
 }
 
-/* Who holds the socket; CLAIM_OURS: nobody any more. */
+/* Who holds the socket. CLAIM_DEAF also where the holder has just ended. */
 static enum claim_result look(const struct sockaddr_un *address, socklen_t length, struct claim *claim)
 {
     struct ucred peer = {0};
@@ -93,7 +93,7 @@ static enum claim_result look(const struct sockaddr_un *address, socklen_t lengt
     return found;
 }
 
-enum claim_result claim_take(const char *kind, const char *key, bool deaf, bool busy, struct claim *claim)
+enum claim_result claim_take(const char *kind, const char *key, bool deaf, struct claim *claim)
 {
     struct sockaddr_un address;
     int own = -1, number;
@@ -106,18 +106,19 @@ enum claim_result claim_take(const char *kind, const char *key, bool deaf, bool 
         if (errno != EADDRINUSE)
             return CLAIM_ERROR;
         enum claim_result found = look(&address, length, claim);
-        if (found == CLAIM_STRANGERS || (found == CLAIM_DEAF && deaf) || (found == CLAIM_BUSY && busy))
+        if (found == CLAIM_STRANGERS || (found == CLAIM_DEAF && deaf))
             continue;
         return found;
     }
     if (own < 0)
         return CLAIM_STRANGERS;
-    /* Strangers may have let go of a socket since somebody took a later one. */
-    for (int other = 0; other < SOCKETS; other++) {
-        socklen_t length = address_of(kind, key, other, &address);
-        if (other != number && look(&address, length, claim) == CLAIM_HELD) {
+    /* Strangers may have let go of a socket since somebody took a later one. Those of earlier ones do not count. */
+    for (int later = number + 1; later < SOCKETS; later++) {
+        socklen_t length = address_of(kind, key, later, &address);
+        enum claim_result found = look(&address, length, claim);
+        if (found == CLAIM_HELD || found == CLAIM_BUSY) {
             close(own);
-            return CLAIM_HELD;
+            return found;
         }
     }
     claim->fd = own;

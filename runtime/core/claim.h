@@ -15,7 +15,7 @@ enum claim_result {
     CLAIM_OURS,
     CLAIM_HELD,      /* by a process that counts */
     CLAIM_DEAF,      /* by one that does not listen: it has just begun to hold it, or is none of ours */
-    CLAIM_BUSY,      /* by one for which too many wait, so that nobody knows who it is */
+    CLAIM_BUSY,      /* by one for which too many wait, so that nobody knows who it is: it may be one that counts */
     CLAIM_STRANGERS, /* all its sockets are held by processes that do not count */
     CLAIM_ERROR,     /* errno says which */
 };
@@ -29,7 +29,8 @@ struct claim {
  * in, every process may. */
 bool claim_user_counts(uid_t user);
 
-/* Claim KIND/KEY. A long key is known by its end. `deaf` and `busy`: to pass over such holders. */
-enum claim_result claim_take(const char *kind, const char *key, bool deaf, bool busy, struct claim *claim);
+/* Claim KIND/KEY. A long key is known by its end. `deaf`: to pass over such holders. Each call leaves a connection with
+ * the holder, which has room for some: whoever has to know for long keeps `fd`. */
+enum claim_result claim_take(const char *kind, const char *key, bool deaf, struct claim *claim);
 
 #endif

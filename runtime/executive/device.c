@@ -119,10 +119,8 @@ int device_claim(struct fl_block *block)
         until_ns = listening_ns;
     int status = FL_FAILED;
     for (bool decided = false; !decided;) {
-        /* Whoever has to wait for another process makes outputs safe, which nobody may prevent. */
         bool late = fl_now_ns() >= until_ns;
-        enum claim_result result =
-            claim_take("flotilla", key, fl_now_ns() >= listening_ns, late && service->patience_ms, &claim);
+        enum claim_result result = claim_take("flotilla", key, fl_now_ns() >= listening_ns, &claim);
         decided = true;
         if (result == CLAIM_OURS || result == CLAIM_STRANGERS) {
             service->claim_fd = result == CLAIM_OURS ? claim.fd : 0;

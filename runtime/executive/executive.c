@@ -272,7 +272,8 @@ static int64_t next_release(struct executive *executive, int64_t expected_ns, in
     int64_t late_ns = now_ns - next_ns;
     result->overruns++;
     result->last_overrun = (struct overrun_of_step){result->steps - 1, now_ns, late_ns};
-    lateness->in_a_row += late_ns > lateness->late_ns;
+    /* With a trigger each step has a release of its own, so none catches up. */
+    lateness->in_a_row += task->trigger || late_ns > lateness->late_ns;
     lateness->late_ns = late_ns;
     if (task->overrun == OVERRUN_STOP_SAFE || (task->overruns && lateness->in_a_row >= task->overruns)) {
         snprintf(text, sizeof text,

@@ -357,12 +357,14 @@ static void safe(struct fl_block *block)
  * work, or works for an earlier program, is commanded again and again, as long as it says anything. */
 static void await_rest(struct fl_block *block)
 {
-    enum { PERIOD_MS = 10, AGAIN_MS = 100, SILENT_MS = 300, LONGEST_MS = 800 /* a watchdog waits for a second */ };
+    enum { AGAIN_MS = 100, SILENT_MS = 300, LONGEST_MS = 800 /* a watchdog waits for a second */ };
     const int64_t ms = 1000000;
     const struct epos2_block *set = block->parameters;
     struct state *state = block->state;
-    /* The block that sends SYNC may have ended before this one. */
-    const struct epos2_command off = {.sync = set->sync == 0, .target = (double)NAN};
+    const int64_t heartbeat_ns = llround(set->heartbeat * 1e9) / (2 * EPOS2_HEARTBEATS), most_ns = 10 * ms;
+    const struct timespec nap = {.tv_nsec = (long)(heartbeat_ns < most_ns ? heartbeat_ns : most_ns)};
+    /* The block of this task that sends SYNC may have ended before this one. */
+    const struct epos2_command off = {.sync = atomic_load(&state->sync.ours), .target = (double)NAN};
     struct can_frame out[EPOS2_FRAMES];
     int64_t now_ns = fl_now_ns(), heard_ns = now_ns, sent_ns = 0;
     while (can_connected(&state->can) && now_ns - state->safe_ns < LONGEST_MS * ms) {
@@ -376,7 +378,7 @@ static void await_rest(struct fl_block *block)
             send_all(state, out,
                      works ? epos2_advance(&state->drive, now_ns, &off, out) : epos2_quick_stop(&state->drive, out));
         }
-        nanosleep(&(struct timespec){.tv_nsec = PERIOD_MS * 1000000L}, NULL);
+        nanosleep(&nap, NULL);
         now_ns = fl_now_ns();
     }
 }

@@ -2,7 +2,7 @@
 
 #include "core/claim.h"
 
-#include <stddef.h>
+#include <poll.h>
 #include <unistd.h>
 
 enum { DEAF = 8 }; /* times that a holder may be found to be none that listens */
@@ -10,14 +10,14 @@ enum { DEAF = 8 }; /* times that a holder may be found to be none that listens *
 void can_sync_claim(struct can_sync *sync, const char *interface)
 {
     struct claim claim;
-    if (atomic_load(&sync->mine))
+    if (atomic_load(&sync->mine) || (sync->fd > 0 && poll(&(struct pollfd){.fd = sync->fd}, 1, 0) == 0))
         return;
-    enum claim_result result = claim_take("flotilla-can-sync", interface, sync->deaf >= DEAF, false, &claim);
+    if (sync->fd > 0)
+        close(sync->fd);
+    enum claim_result result = claim_take("flotilla-can-sync", interface, sync->deaf >= DEAF, &claim);
     sync->deaf = result == CLAIM_DEAF ? sync->deaf + 1 : 0;
-    if (result == CLAIM_OURS)
-        sync->fd = claim.fd;
-    else if (claim.fd >= 0)
-        close(claim.fd);
+    sync->fd = claim.fd > 0 ? claim.fd : 0;
+    atomic_store(&sync->ours, result == CLAIM_OURS || claim.process == getpid());
     atomic_store(&sync->mine, result == CLAIM_OURS);
 }
 

@@ -27,7 +27,7 @@ static struct {
 } logged = {.lock = PTHREAD_MUTEX_INITIALIZER};
 
 enum { WHY_BYTES = 192 };
-/* Where the first message of the calling thread goes instead; NULL: nowhere else. */
+/* Where the first error of the calling thread goes instead; NULL: nowhere else. */
 static _Thread_local char *why;
 
 static bool is_new(struct place place)
@@ -54,7 +54,7 @@ static void write_log(void *context, const dds_log_data_t *data)
     int length = (int)strlen(text);
     while (length && strchr(".\n", text[length - 1]))
         length--;
-    if (why) {
+    if (why && data->priority & (DDS_LC_ERROR | DDS_LC_FATAL)) {
         if (!*why)
             snprintf(why, WHY_BYTES, "%.*s", length, text);
     } else if (is_new((struct place){data->file, data->line})) {
@@ -131,11 +131,14 @@ static struct domain *domain_numbered(uint32_t number)
 
 /* Get the participant, which the first caller creates; negative: a DDS error, which is logged. Release it after
  * success. */
-static dds_entity_t have_participant(struct fl_block *block, uint32_t number)
+static dds_entity_t have_participant(struct fl_block *block, uint32_t number, struct fl_reasons *reasons)
 {
     dds_entity_t participant = DDS_RETCODE_OUT_OF_RESOURCES;
     pthread_mutex_lock(&lock);
     struct domain *domain = domain_numbered(number);
+    if (!domain)
+        fl_reasons_log(reasons, block, fl_now_ns(), "DDS domain %u: a task has %d domains at most", (unsigned)number,
+                       DOMAINS);
     if (domain && !domain->users) {
         char reason[WHY_BYTES] = "";
         dds_set_log_sink(write_log, NULL);
@@ -211,7 +214,7 @@ void dds_run(const struct dds_endpoint *endpoint, const struct dds_topic *topic,
 {
     struct fl_reasons reasons = {0};
     do {
-        dds_entity_t participant = have_participant(block, topic->domain);
+        dds_entity_t participant = have_participant(block, topic->domain, &reasons);
         if (participant < 0)
             continue;
         bool done = serve(endpoint, topic, block, driver, context, participant, &reasons);

@@ -48,12 +48,12 @@ static pid_t holder(uid_t user, int sockets, enum how how)
     return child_begin(user, hold, &(struct held){sockets, how});
 }
 
-static enum claim_result take(bool deaf, bool busy, struct claim *claim)
+static enum claim_result take(bool deaf, struct claim *claim)
 {
     bool root = geteuid() == 0;
     if (root)
         assert_int_equal(seteuid(SERVICE), 0);
-    enum claim_result result = claim_take("flotilla", key, deaf, busy, claim);
+    enum claim_result result = claim_take("flotilla", key, deaf, claim);
     if (root)
         assert_int_equal(seteuid(0), 0);
     return result;
@@ -67,25 +67,26 @@ static void passes_over_strangers(void **state)
         uid_t user;
         int sockets;
         enum how how;
-        bool deaf, busy;
+        bool deaf;
         enum claim_result result;
     } cases[] = {
-        {SERVICE, 1, LISTENS, true, false, CLAIM_HELD},
-        {1000, 1, LISTENS, true, false, CLAIM_HELD},
-        {0, 1, LISTENS, true, false, CLAIM_HELD},
-        {APP, 1, LISTENS, false, false, CLAIM_OURS},
-        {912, 2, LISTENS, false, false, CLAIM_OURS}, /* this computer has no group of control tasks */
-        {APP, SOCKETS, LISTENS, false, false, CLAIM_STRANGERS},
-        {APP, 1, DEAF, false, false, CLAIM_DEAF},
-        {APP, 1, DEAF, true, false, CLAIM_OURS},
-        {APP, SOCKETS, DEAF, true, false, CLAIM_STRANGERS},
-        {APP, 1, BUSY, true, false, CLAIM_BUSY},
-        {APP, 1, BUSY, true, true, CLAIM_OURS},
+        {SERVICE, 1, LISTENS, true, CLAIM_HELD},
+        {1000, 1, LISTENS, true, CLAIM_HELD},
+        {0, 1, LISTENS, true, CLAIM_HELD},
+        {APP, 1, LISTENS, false, CLAIM_OURS},
+        {912, 2, LISTENS, false, CLAIM_OURS}, /* this computer has no group of control tasks */
+        {APP, SOCKETS, LISTENS, false, CLAIM_STRANGERS},
+        {APP, 1, DEAF, false, CLAIM_DEAF},
+        {APP, 1, DEAF, true, CLAIM_OURS},
+        {APP, SOCKETS, DEAF, true, CLAIM_STRANGERS},
+        {APP, 1, BUSY, true, CLAIM_BUSY},
     };
-    for (size_t i = 0; i < sizeof cases / sizeof cases[0] && geteuid() == 0; i++) {
+    if (geteuid() != 0)
+        skip();
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
         struct claim claim;
         pid_t child = holder(cases[i].user, cases[i].sockets, cases[i].how);
-        assert_int_equal(take(cases[i].deaf, cases[i].busy, &claim), cases[i].result);
+        assert_int_equal(take(cases[i].deaf, &claim), cases[i].result);
         if (cases[i].result == CLAIM_HELD)
             assert_int_equal(claim.process, child);
         assert_int_equal(claim.fd >= 0, cases[i].result == CLAIM_HELD || cases[i].result == CLAIM_OURS);
@@ -103,22 +104,47 @@ static void one_has_it_when_strangers_go(void **state)
     if (geteuid() != 0)
         skip();
     pid_t stranger = holder(APP, 1, LISTENS);
-    assert_int_equal(take(false, false, &first), CLAIM_OURS);
+    assert_int_equal(take(false, &first), CLAIM_OURS);
     child_end(stranger);
-    assert_int_equal(take(false, false, &second), CLAIM_HELD);
+    assert_int_equal(take(false, &second), CLAIM_HELD);
     assert_int_equal(second.process, getpid());
     close(first.fd);
     struct pollfd gone = {.fd = second.fd};
     assert_int_equal(poll(&gone, 1, 60 * 1000), 1);
     close(second.fd);
-    assert_int_equal(take(false, false, &first), CLAIM_OURS);
+    assert_int_equal(take(false, &first), CLAIM_OURS);
     close(first.fd);
+}
+
+static void claim_it(void *context)
+{
+    struct claim claim;
+    (void)context;
+    if (claim_take("flotilla", key, false, &claim) != CLAIM_OURS)
+        _exit(1);
+}
+
+/* Each leaves a connection, and there is room for 128. Seen to fail where a holder with no room was passed over: after
+ * 129 looks a second process had the device, too. */
+static void many_looks_take_it_from_nobody(void **state)
+{
+    (void)state;
+    pid_t child = child_begin(geteuid(), claim_it, NULL);
+    for (int i = 0; i < 150; i++) {
+        struct claim claim;
+        enum claim_result result = take(true, &claim);
+        assert_true(result == CLAIM_HELD || result == CLAIM_BUSY);
+        if (claim.fd >= 0)
+            close(claim.fd);
+    }
+    child_end(child);
 }
 
 int main(void)
 {
     const struct CMUnitTest all[] = {
         cmocka_unit_test(passes_over_strangers),
+        cmocka_unit_test(many_looks_take_it_from_nobody),
         cmocka_unit_test(one_has_it_when_strangers_go),
     };
     snprintf(key, sizeof key, "claim-%d", (int)getpid());

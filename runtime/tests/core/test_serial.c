@@ -472,7 +472,6 @@ static void says_that_nothing_comes_or_nothing_of_use(void **state)
     said_end(&said);
 }
 
-/* Seen to fail with TIOCEXCL, which stays when a process is killed. */
 /* QEMU's UART never overruns, so the counts of one are emulated. What it lost before it was opened is not the task's.
  * Seen to fail where nobody asks for the counts, and where those of before count. */
 static void counts_and_names_overruns(void **state)
@@ -497,6 +496,7 @@ static void counts_and_names_overruns(void **state)
     said_end(&said);
 }
 
+/* Seen to fail with TIOCEXCL, which stays when a process is killed. */
 static void is_exclusive_while_open_only(void **state)
 {
     (void)state;
