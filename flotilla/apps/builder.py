@@ -64,12 +64,17 @@ def build(subject: app.App, board: Board, out: Path, run: toolchain.Run = toolch
 
 
 def _check_links(directory: Path) -> None:
-    """Refuse links by which an app would get any file of this computer: those to beside the app, shared by several, do
-    no harm."""
-    for path in sources.files(directory):
-        if path.is_symlink() and not sources.inside(directory.parent, path):
+    """Refuse links by which an app would get any file of this computer. What several apps share may lie beside them,
+    but for what is hidden there, such as keys of a user."""
+    beside = directory.parent.resolve()
+    for path in filter(Path.is_symlink, sources.files(directory)):
+        target = path.resolve()
+        named = target.relative_to(beside).parts if sources.inside(beside, path) else ()
+        if not named or any(part.startswith(".") for part in named) or sources.inside(paths.KEYS, path):
             where = paths.shown(directory.parent)
             raise UserError(f"{paths.shown(path)}: is a link that leads out of {where}; put a copy in its place")
+        if target in path.absolute().parents:
+            raise UserError(f"{paths.shown(path)}: is a link to a directory that has it; remove it")
 
 
 def _drives(description: app.Make, out: Path) -> bool:
@@ -100,7 +105,11 @@ def _blocks(
             needs = privileges.needs_of(runtime.check_plugins(Path(directory), system))
         runtime.check_task(task, task.read_bytes(), Path(directory), system)
     shutil.copyfile(task, out / app.TASK)
-    return privileges.drives_io_ports(yaml.safe_load(task.read_text()), needs, inside)
+    try:
+        described = yaml.safe_load(task.read_text())
+    except yaml.YAMLError as error:  # a plug-in may end the program that judges tasks
+        raise UserError(f"{paths.shown(task)}: {error}") from None
+    return privileges.drives_io_ports(described, needs, inside)
 
 
 def _fmu(subject: app.App, description: app.Fmu, system: System, out: Path, run: toolchain.Run) -> bool:
@@ -125,6 +134,9 @@ def _make(subject: app.App, description: app.Make, system: System, out: Path, ru
             subject.directory, source, symlinks=True, ignore=shutil.ignore_patterns(*sources.LEFT_BEHIND, *_BUILT)
         )
         made = source / description.program
+        if not sources.inside(source, made.parent):
+            where = paths.shown(subject.directory / app.FILE)
+            raise UserError(f"{where}: program: {description.program}: lies behind a link; name a file of the app")
         made.unlink(missing_ok=True)
         # From the environment, because a Makefile may add to these; it cannot to what stands on make's command line.
         flags = " ".join(["-O2", *toolchain.LONG_TIMES, "-I/out/include"])

@@ -314,7 +314,8 @@ def follow_log(to: Connection, name: str) -> None:
     sys.stdout.flush()
     with suppress(KeyboardInterrupt):
         argv = [*DIE_WITH_PARENT, *to.argv("log", name)]
-        with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, errors="replace") as process:
+        pipe = subprocess.PIPE
+        with subprocess.Popen(argv, stdout=pipe, stderr=subprocess.STDOUT, text=True, errors="replace") as process:
             assert process.stdout
             try:
                 for line in _lines(process.stdout):

@@ -7,6 +7,7 @@ with the lowest priority: what controls the robot is not disturbed.
 from __future__ import annotations
 
 import hashlib
+import shutil
 import subprocess
 import tarfile
 import tempfile
@@ -65,13 +66,23 @@ class Compiler:
             need_kib = 2 * sent.stat().st_size // 1024 + _RESERVE_KIB
             with progress.step(f"{self._name} compiled on {self._to.robot.name}"):
                 self._to.stream("compile", self._name, digest, str(need_kib), *argv, stdin=sent, stdout=made, log=log)
-            # tar, which keeps what it unpacks inside: the other end may be anybody's by now. Whoever reads what was
-            # made follows no link that leads out of `work`: images.builder.runtime.command refuses these.
-            unpack = ["tar", "-x", "--no-same-owner", "--no-same-permissions", "-f", str(made), "-C", str(work)]
-            argv = [*limited(remote.MADE_BYTES), *unpack]
-            done = subprocess.run(argv, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise UserError(f"{self._to.robot.name}: what it compiled is no archive: {done.stderr.strip()[:500]}")
+            # Into an empty directory, because tar follows links that are there: the other end may be anybody's by now.
+            # Whoever reads what was made follows no link that leads out of `work`: images.builder.runtime.command
+            # refuses these. By standard input tar unpacks nothing that is compressed.
+            unpacked = Path(directory) / "made"
+            unpacked.mkdir()
+            argv = [*limited(remote.MADE_BYTES), "tar", "-x", "--no-same-owner", "--no-same-permissions", "-f", "-"]
+            with made.open("rb") as archive:
+                done = subprocess.run(
+                    [*argv, "-C", str(unpacked)], stdin=archive, capture_output=True, text=True, errors="replace",
+                    check=False,
+                )  # fmt: skip
+            if done.returncode:
+                raise UserError(f"{self._to.robot.name}: what it compiled is no archive: {done.stderr.strip()[:500]}")
+            for old in work.iterdir():
+                shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+            for new in unpacked.iterdir():
+                new.rename(work / new.name)
 
     def _bring(self, image: Path) -> str:
         """Its hash; the robot has it now."""

@@ -32,7 +32,8 @@ def command(
     `root`: the tree that is the root directory, read-only; without one it is empty. `readable`: files and directories
     of this computer, at their own places. `mounted`, `writable`: directories by their places there.
     """
-    options = ["--unshare-all", "--die-with-parent", "--new-session", "--cap-drop", "ALL", "--uid", "0", "--gid", "0"]
+    options = ["--unshare-all", "--unshare-user", "--disable-userns", "--die-with-parent", "--new-session"]
+    options += ["--cap-drop", "ALL", "--uid", "0", "--gid", "0"]
     options += ["--clearenv", *(word for item in (environment or {}).items() for word in ("--setenv", *item))]
     if root:
         options += ["--ro-bind", str(root), "/"]

@@ -11,7 +11,9 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import pydantic
 
 from flotilla.common import cache, namespace, paths, progress, sandbox, sources, together
 from flotilla.common.errors import UserError
@@ -141,6 +143,22 @@ def compile_shared(
         return made.read_bytes()
 
 
+class _Parameter(pydantic.BaseModel):
+    name: str
+    default: str = ""
+    needs: Literal["can", "io-ports", "camera"] | None = None
+
+
+class _Block(pydantic.BaseModel):
+    """Of what `flotilla-blocks --json` lists, what is used here."""
+
+    name: str
+    parameters: list[_Parameter]
+
+
+_LISTING = pydantic.TypeAdapter(list[_Block])
+
+
 def check_plugins(directory: Path, system: System) -> list[dict[str, Any]]:
     """Let the runtime judge plug-ins: the interface that they were made for, names that are taken. Returns all blocks.
 
@@ -150,12 +168,10 @@ def check_plugins(directory: Path, system: System) -> list[dict[str, Any]]:
     if done.returncode:
         raise UserError(_said("flotilla-blocks", done).replace(f"{directory}/", ""))
     try:
-        listing: list[dict[str, Any]] = json.loads(done.stdout)
-    except ValueError as error:  # a plug-in may write there, too
-        raise UserError(
-            f"the list of blocks is not JSON: {error}; plug-ins must not write to standard output"
-        ) from None
-    return listing
+        listing = _LISTING.validate_json(done.stdout)
+    except ValueError:  # a plug-in may write there, too
+        raise UserError("no list of blocks came; plug-ins must not write to standard output or end it") from None
+    return [block.model_dump(exclude_none=True) for block in listing]
 
 
 def check_task(path: Path, content: bytes, plugins: Path | None = None, system: System = HOST) -> None:
@@ -177,8 +193,8 @@ def _said(program: str, done: subprocess.CompletedProcess[str]) -> str:
     """Why it failed. Of a crash it does not say so itself, and a code of a block may say anything."""
     if refused := sandbox.refusal(done.stderr):
         raise refused
-    if done.returncode <= _BY_SIGNAL:
-        return done.stderr.strip()
+    if done.returncode - _BY_SIGNAL not in {each.value for each in signal.Signals}:
+        return done.stderr.strip() or f"{program} ended with status {done.returncode}"
     crashed = f"{program} was ended by {signal.Signals(done.returncode - _BY_SIGNAL).name}"
     return f"{crashed}: code of a block crashes when it is loaded or configured\n{done.stderr}".strip()
 

@@ -23,7 +23,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
 from images.builder import runtime
-from images.builder.lock import HOST
+from images.builder.lock import HOST, runtime_lock
 
 SECRET = "the key of a release"
 ATTACK = """\
@@ -52,6 +52,8 @@ __attribute__((constructor)) static void attack(void)
         close(out);
     if (connect(socket(AF_INET, SOCK_STREAM, 0), (struct sockaddr *)&to, sizeof to) == 0)
         breaks = fprintf(stderr, "reached the network\\n");
+    if (unshare(CLONE_NEWUSER) == 0)
+        breaks = fprintf(stderr, "made a user namespace\\n");
     if (unshare(CLONE_NEWNS) == 0) /* of this process alone: a test that fails must not change the computer */
         breaks = fprintf(stderr, "may mount\\n");
     if (chroot(".") == 0)
@@ -108,6 +110,32 @@ def test_a_plugin_that_is_checked_reaches_nothing(
     assert not (tmp_path / "marker").exists()
 
 
+LIES = [
+    "5",
+    "[1]",
+    '{"a": 1}',
+    '[{"name": [], "parameters": []}]',
+    '[{"name": "a", "parameters": null}]',
+    "[" * 100_000,
+]
+
+
+@pytest.mark.parametrize("status", [0, 1, 255])
+@pytest.mark.parametrize("listed", LIES, ids=range(len(LIES)))
+def test_a_plugin_that_lies_about_blocks_is_refused(tmp_path: Path, listed: str, status: int) -> None:
+    """Seen to fail: with status 0 or 255 in a traceback."""
+    (tmp_path / "listed").write_text(f'const char listed[] = "{listed.replace(chr(34), chr(92) + chr(34))}";\n')
+    (tmp_path / "lie.c").write_text(
+        '#include "listed"\n#include <unistd.h>\n__attribute__((constructor)) static void lie(void)\n'
+        f"{{\n    (void)!write(1, listed, sizeof listed - 1);\n    _exit({status});\n}}\n"
+    )
+    (tmp_path / "blocks").mkdir()
+    plugin = tmp_path / "blocks/lie.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", plugin, tmp_path / "lie.c"], check=True)
+    with pytest.raises(UserError, match=r"no list of blocks came|ended with status"):
+        runtime.check_plugins(tmp_path / "blocks", HOST)
+
+
 @pytest.fixture
 def board(fleet: Fleet) -> Board:
     return next(board for board in fleet.boards.values() if board.system == HOST)
@@ -135,6 +163,19 @@ def test_a_makefile_reaches_nothing(made: Callable[..., Path], tmp_path: Path, d
     assert (out / "hover").read_text().splitlines()[0] == "ran, and broke nothing"
     assert "No such file" in (out / "hover").read_text()
     assert not (tmp_path / "marker").exists()
+
+
+def test_no_file_behind_a_link_is_removed_for_a_program(board: Board, tmp_path: Path) -> None:
+    """Seen to fail: a file of the computer that builds was removed before make ran."""
+    scaffold.create("make", "hover", tmp_path)
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "keys/release").write_text(SECRET)
+    (tmp_path / "hover/conf").symlink_to(tmp_path / "keys")
+    (tmp_path / "hover/app.yml").write_text("kind: make\nprogram: conf/release\n")
+    subject = app.load(tmp_path / "hover")
+    with pytest.raises(UserError, match=r"program: conf/release: lies behind a link"):
+        builder.build(subject, board, tmp_path / "out")
+    assert (tmp_path / "keys/release").read_text() == SECRET
 
 
 LINKS = {
@@ -198,13 +239,11 @@ def behind_a_link(tar: tarfile.TarFile, place: Path) -> None:
 
 
 @pytest.fixture
-def robots_plugin(
-    tmp_path: Path, fleet: Fleet, board: Board, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[bytes], bytes]:
-    """The plug-in that a robot compiles, when it answers with that."""
-    compiler = tmp_path / "compiler"
-    compiler.write_text("")
-    monkeypatch.setattr(remote_compiler, "packed", lambda lock: compiler)
+def compiler(tmp_path: Path, fleet: Fleet, board: Board, monkeypatch: pytest.MonkeyPatch) -> remote_compiler.Compiler:
+    """That of a robot which answers with the file `answer`."""
+    packed = tmp_path / "compiler"
+    packed.write_text("")
+    monkeypatch.setattr(remote_compiler, "packed", lambda lock: packed)
     script = tmp_path / "robot"
     script.write_text(
         "#!/bin/sh\ncase $* in *'flotilla has-compiler '*) echo yes ;; "
@@ -212,13 +251,18 @@ def robots_plugin(
     )
     script.chmod(0o755)
     robot = next(robot for robot in fleet.robots.values() if robot.board == board.name)
-    to = remote.Connection(robot, [str(script)])
+    return remote_compiler.Compiler(remote.Connection(robot, [str(script)]), "hover")
+
+
+@pytest.fixture
+def robots_plugin(tmp_path: Path, compiler: remote_compiler.Compiler) -> Callable[[bytes], bytes]:
+    """The plug-in that a robot compiles, when it answers with that."""
 
     def compiled(answer: bytes) -> bytes:
         (tmp_path / "answer").write_bytes(answer)
         source = tmp_path / "source.c"
         source.write_text("#include <flotilla/block.h>\n")
-        return runtime.compile_plugin(source, HOST, run=remote_compiler.Compiler(to, "hover").run)
+        return runtime.compile_plugin(source, HOST, run=compiler.run)
 
     return compiled
 
@@ -239,6 +283,28 @@ def test_a_robot_that_compiles_returns_one_file(
     assert sorted(path.name for path in (tmp_path / "keys").iterdir()) == ["release"]
     assert (tmp_path / "keys/release").read_text() == SECRET
     assert not (tmp_path / "marker").exists()
+
+
+def test_a_robot_that_compiles_writes_behind_no_link(compiler: remote_compiler.Compiler, tmp_path: Path) -> None:
+    """Of those that a program's source has. Seen to fail: tar followed it."""
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work/there").symlink_to(tmp_path / "keys")
+    with tarfile.open(tmp_path / "answer", "w") as tar:
+        add(tar, "there/marker", b"x")
+    compiler.run(runtime_lock(HOST), tmp_path / "work", ["make"], tmp_path / "log")
+    assert list((tmp_path / "keys").iterdir()) == []
+    assert (tmp_path / "work/there/marker").read_bytes() == b"x"
+    assert not (tmp_path / "work/there").is_symlink()
+
+
+def test_a_robot_that_compiles_sends_nothing_compressed(robots_plugin: Callable[[bytes], bytes]) -> None:
+    """Of which little may become much. Seen to fail: tar unpacked it."""
+    sent = io.BytesIO()
+    with tarfile.open(fileobj=sent, mode="w:gz") as tar:
+        add(tar, "plugin.so", b"x")
+    with pytest.raises(UserError, match=r"what it compiled is no archive: .*ompressed"):
+        robots_plugin(sent.getvalue())
 
 
 def test_a_robot_that_compiles_and_does_not_end(
@@ -299,13 +365,16 @@ def test_a_unit_with_a_link_that_leads_out_is_refused(tmp_path: Path) -> None:
         fmu.unpacked(tmp_path / "two-lags", None, tmp_path / "unpacked")
 
 
-def test_an_app_with_a_link_to_any_file_of_this_computer_is_refused(tmp_path: Path, board: Board) -> None:
+@pytest.mark.parametrize("target", ["/etc/hostname", "../.ssh/id", "..", "../.ssh", "../other/../../x", "."])
+def test_an_app_with_a_link_to_any_file_of_this_computer_is_refused(tmp_path: Path, board: Board, target: str) -> None:
     """Seen to fail: the app was built; an assembler's `.incbin` puts such a file into the plug-in."""
     scaffold.create("block", "mine", tmp_path)
     (tmp_path / "shared.h").write_text("")
     (tmp_path / "mine/beside.h").symlink_to("../shared.h")
-    (tmp_path / "mine/key").symlink_to("/etc/hostname")
-    with pytest.raises(UserError, match=r"mine/key: is a link that leads out of"):
+    (tmp_path / ".ssh").mkdir()
+    (tmp_path / ".ssh/id").write_text(SECRET)
+    (tmp_path / "mine/key").symlink_to(target)
+    with pytest.raises(UserError, match=r"mine/key: is a link (that leads out of|to a directory that has it)"):
         builder.build(app.load(tmp_path / "mine"), board, tmp_path / "out")
 
 
