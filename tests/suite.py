@@ -1,7 +1,7 @@
 """pytest plugin: what `make test` runs of what there is, in which order, and in which of several parts.
 
-`make test-all` runs every test; `make test` those without the mark `nightly`. Of the folders that need guests it runs
-what suite.yml names, so all others get that mark here.
+`make test-all` runs every test; `make test` those without the mark `nightly`, which all others get here: it runs what
+suite.yml names, and what needs no guest and is cheap.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from tests import costs
 from tests.tiers import SAME_PLACE, tier, together
 
 FILE = Path(__file__).with_suffix(".yml")
+CHEAP_S = 3.0
+"""Processor seconds by costs.json up to which a test that needs no guest runs always."""
 CHECKS_S = 240
 """Processor seconds of what is no test, which the first part does: lint, the C unit tests, fuzzing."""
 
@@ -36,12 +38,13 @@ def named() -> Mapping[str, Sequence[str]]:
 
 
 def stays(nodeid: str, names: Collection[str] | None = None) -> bool:
-    """Whether suite.yml names it (the test, its function, its file, its file with parameters), or it needs no guest."""
+    """Whether suite.yml names it (the test, its function, its file, its file with parameters), or it is cheap."""
     names = names if names is not None else {name for area in named().values() for name in area}
     test = nodeid.removeprefix("tests/")
     function, bracket, parameters = test.partition("[")
     file = function.partition("::")[0]
-    return tier(nodeid) != "boot" or any(name in names for name in (test, function, file, file + bracket + parameters))
+    cheap = tier(nodeid) != "boot" and costs.of(nodeid) <= CHEAP_S
+    return cheap or any(name in names for name in (test, function, file, file + bracket + parameters))
 
 
 def by_cost(nodeids: Iterable[str]) -> dict[str, float]:

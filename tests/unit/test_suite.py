@@ -12,10 +12,9 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from tests import costs, suite, tiers
+from tests import costs, suite
 
 TESTS = paths.PROJECT / "tests"
-GUESTS = [folder for folder, tier in tiers.TIERS.items() if tier == "boot"]
 
 
 def functions(file: Path) -> set[str]:
@@ -29,7 +28,6 @@ def test_what_is_named_is_there() -> None:
         for name in names:
             file, _, function = name.partition("::")
             path = file.partition("[")[0]
-            assert tiers.tier(f"tests/{path}") == "boot", f"suite.yml: {name} needs no guest, so it runs anyway"
             assert (TESTS / path).is_file(), f"suite.yml: {name}: there is no such file"
             assert not function or function.partition("[")[0] in functions(TESTS / path), f"suite.yml: no test {name}"
 
@@ -53,10 +51,14 @@ def test_no_area_is_left_without_a_test() -> None:
         ("tests/boot/test_d.py::test_one[y]", False),
         ("tests/provisioning/test_a.py::test_one", False),
         ("tests/unit/test_any.py::test_one", True),
+        ("tests/unit/test_any.py::test_dear", False),
+        ("tests/unit/test_named.py::test_dear", True),
     ],
 )
-def test_of_tests_that_need_guests_those_stay_that_are_named(nodeid: str, stays: bool) -> None:
+def test_those_stay_that_are_named_or_cheap(nodeid: str, stays: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(costs, "of", lambda nodeid: suite.CHEAP_S + ("dear" in nodeid))
     names = ["boot/test_a.py", "boot/test_b.py::test_one", "boot/test_c.py::test_one[x/y-z]", "boot/test_d.py[x]"]
+    names.append("unit/test_named.py")
     assert suite.stays(nodeid, names) == stays
 
 
@@ -140,7 +142,7 @@ def test_a_failure_begins_with_the_command_that_repeats_it(project: Path, more: 
 
 def test_each_name_is_that_of_a_test_of_each_time() -> None:
     """As pytest collects them, with their parameters: whatever is marked `nightly` itself stays so."""
-    found = collected(paths.PROJECT, "-m", "not nightly", *(f"tests/{folder}" for folder in GUESTS))
+    found = collected(paths.PROJECT, "-m", "not nightly", "tests")
     for name in (name for names in suite.named().values() for name in names):
         assert any(suite.stays(test, [name]) for test in found), f"suite.yml names {name}, which `make test` leaves out"
 
