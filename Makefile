@@ -27,110 +27,110 @@ MAKEFLAGS += --no-print-directory
 
 ##@ Cards
 .PHONY: image images kernel flash boot ssh verify bundle verify-bundle size
-image: | setup ## card image of one robot: make image ROBOT=3
+image: | setup ## build the card image of one robot | ROBOT=3
 	$(Q)$(FLOTILLA) image $(call need,ROBOT)
 
-images: | setup ## card images of the whole fleet
+images: | setup ## build the card images of all robots
 	$(Q)$(FLOTILLA) image --all
 
-kernel: | setup ## our own real-time kernel as a Debian package: make kernel [BOARD=]
+kernel: | setup ## compile the lean PREEMPT_RT kernel as a Debian package | [BOARD=smartcoret3]
 	$(Q)$(FLOTILLA) kernel $(if $(value BOARD),$(call given,BOARD))
 
-flash: | setup ## write a card and read it back: make flash ROBOT=3 DEV=/dev/sdX (or CARD=file)
+flash: | setup ## write a card and read it back | ROBOT=3 DEV=/dev/sdX|CARD=file [FORCE=word]
 	$(Q)$(FLOTILLA) flash $(call need,ROBOT) $(or $(call option,--file,CARD),$(call need,DEV)) \
 	    $(call option,--force,FORCE)
 
-boot: | setup-lab ## boot a robot's image in QEMU on this terminal
+boot: | setup-lab ## boot a robot's image in QEMU on this terminal | ROBOT=3
 	$(Q)$(FLOTILLA) boot $(call need,ROBOT)
 
-ssh: | setup ## shell on a robot, or on its guest when one runs: make ssh ROBOT=3
+ssh: | setup ## open a shell on a robot, or on its guest if one runs | ROBOT=3
 	$(Q)$(FLOTILLA) ssh $(call need,ROBOT)
 
-verify: | setup ## build a second time under other circumstances and compare to the byte
+verify: | setup ## build an image a second time and compare every byte | ROBOT=3
 	$(Q)$(FLOTILLA) verify $(call need,ROBOT)
 
-bundle: | setup ## the release of a board for robots in service: make bundle [BOARD=] [SIGNATURES="FILE ..."]
+bundle: | setup ## build the update bundle of a board | [BOARD=smartcoret3] [SIGNATURES="FILE ..."]
 	$(Q)$(FLOTILLA) bundle $(if $(value BOARD),$(call given,BOARD)) $(addprefix --signature=,$(call each_given,SIGNATURES))
 
-verify-bundle: | setup ## build what a published bundle holds, and compare: make verify-bundle BUNDLE=file
+verify-bundle: | setup ## rebuild a published bundle and compare it | BUNDLE=file
 	$(Q)$(FLOTILLA) verify-bundle $(call need,BUNDLE)
 
-size: | setup ## the largest packages and files of a robot's image
+size: | setup ## list the largest packages and files of an image | ROBOT=3
 	$(Q)$(FLOTILLA) size $(call need,ROBOT)
 
 ##@ Fleet
 .PHONY: fleet fleet-status fleet-down fleet-scale wheeled wheeled-down radio-capacity provision update releases station-join station-leave station-time
-fleet: | setup-station setup-lab ## a virtual fleet of guests in the background, to try things on: make fleet N=4 [LINK=ibss]
+fleet: | setup-station setup-lab ## start a virtual fleet of QEMU guests in the background | N=4 [LINK=ibss]
 	$(Q)$(FLOTILLA) fleet up $(call need,N) $(call option,--link,LINK)
 
-fleet-status: | setup-station setup-lab ## what the guests of the virtual fleet do
+fleet-status: | setup-station setup-lab ## list the guests of the virtual fleet and their state
 	$(Q)$(FLOTILLA) fleet status
 
-fleet-down: | setup-station setup-lab ## end the virtual fleet
+fleet-down: | setup-station setup-lab ## stop the virtual fleet
 	$(Q)$(FLOTILLA) fleet down
 
-wheeled: | setup-station setup-lab setup-runtime ## wheeled robots in a room, to be driven from this computer, until Ctrl-C: make wheeled [N=1] [ROOM=corner]
+wheeled: | setup-station setup-lab setup-runtime ## simulate wheeled robots to drive, until Ctrl-C | [N=1] [ROOM=corner]
 	$(Q)$(FLOTILLA) wheeled $(call option,--room,ROOM) $(if $(value N),$(call given,N))
 
-wheeled-down: | setup-station setup-lab setup-runtime ## end them
+wheeled-down: | setup-station setup-lab setup-runtime ## stop the simulated wheeled robots
 	$(Q)$(FLOTILLA) wheeled-down
 
-fleet-scale: | setup-station setup-lab ## how provisioning grows with the fleet, on robots in containers, as root: make fleet-scale N=32 [BOARD=]
+fleet-scale: | setup-station setup-lab ## measure provisioning of N robots in containers (root) | N=32 [BOARD=smartcoret3]
 	$(Q)$(FLOTILLA) fleet-scale $(call need,N) $(call option,--board,BOARD)
 
-radio-capacity: | setup-station ## how many robots one radio cell carries, simulated [INVENTORY=dir STANDARD=b|b-short|g|g-mixed RATE=11M AREA=10 PHASES=random UPDATE=1 LIMIT=10 MISSED=1 COMPUTE=400 SEED=1]
+radio-capacity: | setup-station ## simulate how many robots one radio cell carries | [INVENTORY=dir] [STANDARD=b|b-short|g|g-mixed] [RATE=11M] [AREA=10] [PHASES=random] [UPDATE=1] [LIMIT=10] [MISSED=1] [COMPUTE=400] [SECONDS=60] [SEED=1]
 	$(Q)$(FLOTILLA) radio-capacity $(call option,--inventory,INVENTORY) $(call option,--standard,STANDARD) $(call option,--rate,RATE) \
 	    $(call option,--area,AREA) $(call option,--phases,PHASES) $(if $(filter-out 0,$(UPDATE)),--update) $(call option,--limit,LIMIT) \
 	    $(call option,--missed,MISSED) $(call option,--compute,COMPUTE) $(call option,--seconds,SECONDS) $(call option,--seed,SEED)
 
-update: | setup ## robots take the bundle of their board: make update [ROBOT=3] [ON=guests] [ARGS="-e stop_tasks=true"]
+update: | setup ## install the update bundle on the robots | [ROBOT=3] [ON=guests] [ARGS="-e stop_tasks=true"]
 	$(Q)$(MAKE) provision PLAYBOOK=update
 
-provision: | setup ## robots become what the inventory says: make provision [ROBOT=3] [ON=guests] [ARGS=--check]
+provision: | setup ## apply the inventory to the robots | [ROBOT=3] [PLAYBOOK=fleet|tasks|collect|reboot|replace] [ON=guests] [ARGS=--check]
 	$(Q)$(FLOTILLA) provision $(call option,--robot,ROBOT) $(if $(filter guests,$(ON)),--guests) $(call option,--playbook,PLAYBOOK) \
 	    $(if $(value ARGS),-- $(call each_given,ARGS))
 
-releases: | setup ## which release each robot runs, since when, on trial or confirmed: make releases [ROBOT=3] [JSON=1]
+releases: | setup ## list the release of each robot, and its trial state | [ROBOT=3] [JSON=1]
 	$(Q)$(FLOTILLA) releases $(if $(value ROBOT),$(call given,ROBOT)) $(if $(filter-out 0,$(JSON)),--json)
 
-station-join: | setup ## put this computer's 802.11 adapter into the robots' ad hoc cell: make station-join [ADAPTER=wlan0] [STATION=]
+station-join: | setup ## join the robots' ad hoc cell with this computer's radio | [ADAPTER=wlan0] [STATION=name]
 	$(Q)$(FLOTILLA) station-join $(if $(value ADAPTER),$(call given,ADAPTER)) $(call option,--station,STATION)
 
-station-leave: | setup ## take it out of the cell, and put everything back: make station-leave [ADAPTER=wlan0]
+station-leave: | setup ## leave the cell and restore the adapter's settings | [ADAPTER=wlan0]
 	$(Q)$(FLOTILLA) station-leave $(if $(value ADAPTER),$(call given,ADAPTER))
 
-station-time: | setup ## what this computer's chrony needs to lead the robots' time, in build/station-time [STATION=]
+station-time: | setup ## write the chrony files that make this computer the clock | [STATION=name]
 	$(Q)$(FLOTILLA) station-time $(call option,--station,STATION)
 
 ##@ Apps
 .PHONY: new-app import-model deploy
-new-app: | setup ## a working start of an app, in apps/NAME: make new-app KIND=block|ert|fmu|make NAME=hover
+new-app: | setup ## create a working example app in apps/NAME | KIND=block|ert|fmu|make NAME=hover
 	$(Q)$(FLOTILLA) new-app $(call need,KIND) $(call need,NAME)
 
-import-model: | setup ## MATLAB's packNGo archive becomes apps/NAME: ZIP=hover.zip NAME=hover [MODEL=] [SAMPLE_TIMES=0.01,0.05]
+import-model: | setup ## import MATLAB's packNGo archive as apps/NAME | ZIP=hover.zip NAME=hover [MODEL=name] [SAMPLE_TIMES=0.01,0.05]
 	$(Q)$(FLOTILLA) import-model $(call need,ZIP) $(call need,NAME) $(call option,--model,MODEL) \
 	    $(call option,--sample-times,SAMPLE_TIMES)
 
-deploy: | setup ## build, send and run an app: ROBOT=3 APP=dir [ON_ROBOT=1] [KEEP=1 | RUN=start|stop|status|log|remove]
+deploy: | setup ## build an app, copy it to a robot and start it | ROBOT=3 APP=dir [ON_ROBOT=1] [KEEP=1|RUN=start|stop|status|log|remove]
 	$(Q)$(FLOTILLA) deploy $(call need,ROBOT) $(call need,APP) $(call option,--run,RUN) \
 	    $(if $(filter-out 0,$(KEEP)),--keep) $(if $(filter-out 0,$(ON_ROBOT)),--on-robot)
 
 ##@ Inputs
 .PHONY: lock cve check-fleet requirements
-lock: | setup ## resolve the package lists against the mirror: exact versions and hashes [ONLY=name of a lock]
+lock: | setup ## resolve package lists to exact versions and hashes | [ONLY=lock]
 	$(Q)$(FLOTILLA) lock $(call option,--only,ONLY)
 
-cve: | setup ## known vulnerabilities of what the locks hold, by Debian's tracker: make cve TRACKER=FILE or address [JSON=1]
+cve: | setup ## check the locks against Debian's security tracker | TRACKER=file|address [JSON=1]
 	$(Q)$(FLOTILLA) cve $(call option,--tracker,TRACKER) $(if $(filter-out 0,$(JSON)),--json)
 
-check-fleet: | setup ## validate the fleet's description
+check-fleet: | setup ## validate the inventory
 	$(Q)$(FLOTILLA) check-fleet
 
 # One resolution of all groups, which keeps what is locked, then the part of each: no two have different versions.
 all_inputs = requirements/build.in requirements/station.in requirements/tests.in
 locked = $(PYTHON) images/pip_settings.py $(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes \
     --no-emit-index-url --no-header --no-annotate --quiet
-requirements: | setup ## lock the groups of the Python environment anew: requirements/*.in
+requirements: | setup ## lock the Python packages again from requirements/*.in
 	$(Q)cat $(all_inputs:in=lock) >$(BUILD)/requirements.lock
 	$(Q)$(locked) $(all_inputs) -o $(BUILD)/requirements.lock
 	$(Q)set -e; for each in $(all_inputs:.in=); do \
@@ -138,37 +138,37 @@ requirements: | setup ## lock the groups of the Python environment anew: require
 
 ##@ Keys
 .PHONY: rotate-key revoke-key admit-operator revoke-operator operators backup-keys restore-keys
-rotate-key: | setup ## a new key for a robot or the operator: make rotate-key ROBOT=3 or KEY=operator, provision, then RETIRE=1 [FORCE=1]
+rotate-key: | setup ## replace the key of a robot or of the operator | ROBOT=3|KEY=operator, provision, then again with RETIRE=1 [FORCE=1]
 	$(Q)$(FLOTILLA) rotate-key $(if $(value KEY),$(call given,KEY),$(call need,ROBOT)) $(if $(filter-out 0,$(RETIRE)),--retire) \
 	    $(if $(filter-out 0,$(FORCE)),--force)
 
-revoke-key: | setup ## refuse the host key of a robot that is in other hands: make revoke-key ROBOT=3, then provision the others
+revoke-key: | setup ## revoke the host key of a stolen robot | ROBOT=3, then provision the other robots
 	$(Q)$(FLOTILLA) revoke-key $(call need,ROBOT)
 
-admit-operator: | setup ## let a person into all robots for some days: make admit-operator NAME=alice KEY_FILE=alice.pub [DAYS=30] [FROM=addresses] [OUT=directory]
+admit-operator: | setup ## issue a certificate that lets a person into all robots | NAME=alice KEY_FILE=alice.pub [DAYS=30] [FROM=addresses] [OUT=dir]
 	$(Q)$(FLOTILLA) admit-operator $(call option,--days,DAYS) $(call option,--from,FROM) $(call option,--out,OUT) -- $(call need,NAME) $(call need,KEY_FILE)
 
-revoke-operator: | setup ## refuse a person's certificates: make revoke-operator NAME=alice, then provision
+revoke-operator: | setup ## revoke a person's certificates | NAME=alice, then provision
 	$(Q)$(FLOTILLA) revoke-operator $(call need,NAME)
 
-operators: | setup ## who has a certificate, until when, expired or revoked
+operators: | setup ## list the certificates: name, expiry, revocation
 	$(Q)$(FLOTILLA) operators
 
-backup-keys: | setup ## all keys in one encrypted file: make backup-keys OUT=FILE [PASSWORD_FILE=]
+backup-keys: | setup ## write all keys to one encrypted file | OUT=file [PASSWORD_FILE=file]
 	$(Q)$(FLOTILLA) backup-keys $(call need,OUT) $(call option,--password-file,PASSWORD_FILE)
 
-restore-keys: | setup ## put them back: make restore-keys FILE=FILE [PASSWORD_FILE=]
+restore-keys: | setup ## restore all keys from such a file | FILE=file [PASSWORD_FILE=file]
 	$(Q)$(FLOTILLA) restore-keys $(call need,FILE) $(call option,--password-file,PASSWORD_FILE)
 
 ##@ Quality
 .PHONY: check lint docs reference test test-all bench power-cuts
-check: | setup-tests lint check-runtime ## lint, types and unit tests, of the runtime too; no images, no QEMU
+check: | setup-tests lint check-runtime ## run lint, type checks and unit tests, without images
 	$(Q)$(VENV)/bin/pytest -q tests/unit
 
-docs: | $(VENV)/.tests ## the documentation as a site, in build/docs/index.html; warnings are errors, nothing is fetched
+docs: | $(VENV)/.tests ## build the documentation site in build/docs
 	$(Q)$(step) "documentation" $(VENV)/bin/sphinx-build -q -E -W --keep-going -d $(BUILD)/docs/.doctrees docs $(BUILD)/docs
 
-reference: | setup-station runtime ## write the pages of docs/reference that are made from the sources
+reference: | setup-station runtime ## write the generated pages of docs/reference
 	$(Q)$(PYTHON) -m flotilla.reference
 
 lint: | setup-tests docs
@@ -193,7 +193,7 @@ lanes_all = $(test_kernel) test-clock test-others
 lanes_ = test-clock test-others
 # A part compiles it where one of its tests asks for it.
 test_kernel = $(if $(value PART),,test-kernel)
-test: | setup-tests ## checks, images, and a test of each area in QEMU: what CI runs; one tier alone: TIER=unit|runtime|image|boot|nightly
+test: | setup-tests ## run the tests of CI: checks, images, guests in QEMU | [TIER=unit|runtime|image|boot|nightly]
 	$(if $(filter-out $(TIERS) all,$(TIER)),$(error TIER=$(TIER): take one of $(TIERS)))
 	$(if $(filter all nightly,$(TIER)),$(Q)images/install-host-packages tests/all-packages.txt)
 	$(Q)mkdir -p $(dir $(COSTS)); rm -f $(COSTS)
@@ -201,7 +201,7 @@ test: | setup-tests ## checks, images, and a test of each area in QEMU: what CI 
 	    $(MAKE) --no-print-directory -k -j3 $(lanes_$(TIER)); status=$$?; \
 	    $(PYTHON) -m tests.costs show $(COSTS); exit $$status
 
-test-all: | setup-tests ## every test there is, hours; in parts of the same cost: make test-all [PART=3/8]
+test-all: | setup-tests ## run every test (hours), or one of several equal parts | [PART=3/8]
 	$(Q)$(MAKE) test TIER=all
 
 .PHONY: test-kernel test-clock test-others
@@ -235,7 +235,7 @@ covered = $(abspath $(BUILD))/coverage
 uncounted_warnings = -Dc_args='-Wno-format-overflow -Wno-format-truncation'
 coverage_report = $(abspath $(BUILD))/reports/coverage
 coverage: export COVERAGE_FILE = $(covered)/.coverage
-coverage: | setup-tests ## branches of Python and C that unit and runtime tests take, in build/reports/coverage
+coverage: | setup-tests ## report branch coverage of the unit and runtime tests
 	$(Q)mkdir -p $(covered) $(coverage_report)/c; ln -sfn ../cache ../pool ../venv $(covered)
 	$(Q)find $(covered) -name '*.gcda' -delete; rm -f $(COVERAGE_FILE)*
 	$(Q)set -e; $(call configured,$(covered)/runtime,,-Dtests=true -Db_coverage=true -Dbuildtype=debug $(uncounted_warnings))
@@ -251,10 +251,10 @@ coverage: | setup-tests ## branches of Python and C that unit and runtime tests 
 	    --html-nested $(coverage_report)/c/index.html --print-summary $(covered)/runtime
 	$(Q)! grep -v -x 0 $(covered)/status
 
-power-cuts: | setup-station setup-lab setup-runtime ## every power cut of updates replayed: bricks, wrong releases, mistakes found [BOARD=] [MIB=16]
+power-cuts: | setup-station setup-lab setup-runtime ## replay a power cut at every write of an update | [BOARD=smartcoret3] [MIB=16]
 	$(Q)$(FLOTILLA) power-cuts $(call option,--board,BOARD) $(call option,--mib,MIB)
 
-bench: | setup-tests ## wall times and ratios against other builders
+bench: | setup-tests ## measure build times, also of other image builders | [ROBOT=3]
 	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
@@ -265,12 +265,12 @@ configured = { test -f $1/build.ninja && test "$$(cat $1/.place 2>&1)" = "$$(pwd
     { rm -rf $1; $2 $(meson) setup $1 runtime $3 >/dev/null; pwd -P >$1/.place; }
 # What a compiler says matters when it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
-runtime: | setup-runtime ## the runtime's programs for this computer, in build/runtime
+runtime: | setup-runtime ## compile the runtime for this computer in build/runtime
 	@# One after the other: processes that run tests ask for it at once.
 	$(Q)mkdir -p $(BUILD); flock $(BUILD)/.runtime.lock sh -e -c $(call quoted,$(call \
 	    configured,$(BUILD)/runtime); $(call compile,$(BUILD)/runtime))
 
-check-runtime: | setup-runtime $(VENV)/.tests ## format of all C, the runtime's clang-tidy and unit tests with AddressSanitizer and UBSan
+check-runtime: | setup-runtime $(VENV)/.tests ## check the C code: format, clang-tidy, sanitized tests
 	$(Q)$(step) "format of C" $(VENV)/bin/clang-format --dry-run -Werror $$(git ls-files '*.[ch]')
 	$(Q)set -e; $(call configured,$(BUILD)/runtime-sanitized,,-Dtests=true \
 	    -Db_sanitize=address$(comma)undefined -Dbuildtype=debugoptimized)
@@ -278,7 +278,7 @@ check-runtime: | setup-runtime $(VENV)/.tests ## format of all C, the runtime's 
 	$(Q)$(step) "clang-tidy" $(PYTHON) -m runtime.tidy $(BUILD)/runtime-sanitized
 	$(Q)$(step) "unit tests of C" env $(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
-fuzz: | setup-runtime ## the runtime's parsers: a million streams each, then libFuzzer [SECONDS=60 SEED=]; finds go to build/found
+fuzz: | setup-runtime ## fuzz the runtime's parsers with libFuzzer | [SECONDS=60] [SEED=1]
 	$(Q)images/install-host-packages tests/fuzz-packages.txt
 	$(Q)set -e; $(call configured,$(BUILD)/fuzz,CC=clang,-Dtests=true -Dfuzz=true -Dbuildtype=debugoptimized)
 	$(Q)$(call compile,$(BUILD)/fuzz,fuzzers)
@@ -289,46 +289,46 @@ fuzz: | setup-runtime ## the runtime's parsers: a million streams each, then lib
 	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(if $(value SECONDS),$(call given,SECONDS),60) $(if $(value SEED),-seed=$(call given,SEED)) -max_len=1024 -timeout=10 -verbosity=0 \
 	        -artifact_prefix=$$found- $$found $$known 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
-bench-runtime: | setup-runtime runtime ## what a block costs, beside LinuxCNC's HAL, in one run [SECONDS=2 ROUNDS=5]
+bench-runtime: | setup-runtime runtime ## measure blocks' processor time, also of LinuxCNC's HAL | [SECONDS=2] [ROUNDS=5]
 	$(Q)images/install-host-packages runtime/bench/packages.txt
 	$(Q)$(PYTHON) -m runtime.bench.bench $(BUILD)/runtime/flotilla-run $(call option,--seconds,SECONDS) \
 	    $(call option,--rounds,ROUNDS)
 
-station: | setup-station ## a page to see the fleet, drive, tune and record it [PORT=8080 ADDRESS=127.0.0.1 OUT=file INVENTORY=]; show a recording: REPLAY=file
+station: | setup-station ## serve a page that shows, drives and tunes the fleet | [PORT=8080] [ADDRESS=127.0.0.1] [OUT=file] [REPLAY=file] [SECONDS=60]
 	$(Q)$(FLOTILLA) station $(call option,--inventory,INVENTORY) $(call option,--port,PORT) $(call option,--page-address,ADDRESS) $(call option,--record,OUT) \
 	    $(call option,--replay,REPLAY) $(call option,--seconds,SECONDS)
 
 # One program receives, since a port can be received at only once: what it does with it is told by variables too.
 station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)
-record: | setup-station ## record telemetry to an MCAP file, for Foxglove or PlotJuggler: make record [OUT=file] [SECONDS= INVENTORY=]
+record: | setup-station ## record telemetry to an MCAP file | [OUT=file] [SECONDS=60] [PORT=8765] [ADDRESS=127.0.0.1]
 	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
 
-live: | setup-station ## serve it to Foxglove while it comes [PORT=8765 ADDRESS=127.0.0.1]; record it too: OUT=file
+live: | setup-station ## stream live telemetry to Foxglove | [PORT=8765] [ADDRESS=127.0.0.1] [SECONDS=60] [OUT=file]
 	$(Q)$(FLOTILLA) live $(station) $(call option,--record,OUT) $(call each_given,PORT)
 
-top: | setup-station ## how it comes: rate, link, age, flags; keys act on tasks [SECONDS=]; also how tasks run: ASK=1; OUT=, PORT= as above
+top: | setup-station ## show a live telemetry table; start and stop tasks by key | [ASK=1] [SECONDS=60] [OUT=file] [PORT=8765] [ADDRESS=127.0.0.1]
 	$(Q)$(FLOTILLA) top $(station) $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)
 
-drive: | setup-station ## command a robot on wheels: make drive ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN] [INVENTORY=]
+drive: | setup-station ## drive a wheeled robot by keyboard or gamepad | ROBOT=5 [INPUT=keyboard|gamepad|/dev/input/eventN]
 	$(Q)$(FLOTILLA) drive $(call need,ROBOT) $(call option,--input,INPUT) $(call option,--inventory,INVENTORY)
 
-positions: | setup-station ## positions of the indoor positioning system to a robot, with proof: make positions ROBOT=3 [PORT=5010] [INTERFACE=eth1] [STATION=] [INVENTORY=]
+positions: | setup-station ## forward indoor positions to a robot, authenticated | ROBOT=3 [PORT=5010] [INTERFACE=eth1] [STATION=name]
 	$(Q)$(FLOTILLA) positions $(call need,ROBOT) $(call option,--port,PORT) $(call option,--interface,INTERFACE) \
 	    $(call option,--station,STATION) $(call option,--inventory,INVENTORY)
 
-fetch: | setup ## recorder files of a robot's task: make fetch ROBOT=3 TASK=heading [OUT=directory]
+fetch: | setup ## copy the recorder files of a robot's task | ROBOT=3 TASK=heading [OUT=dir]
 	$(Q)$(FLOTILLA) fetch $(call need,ROBOT) $(call need,TASK) $(call option,--out,OUT)
 
-convert: | setup-station ## make MCAP, CSV or MAT of recordings: make convert FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat [TOPIC=/robot3/control/report]
+convert: | setup-station ## convert recordings to MCAP, CSV or MAT | FILE="log-000001.rec log-000002.rec" OUT=run.mcap|run.csv|run.mat [TOPIC=/robot3/control/report]
 	$(Q)$(FLOTILLA) convert $(call option,--topic,TOPIC) $(call need,OUT) $(call need_each,FILE)
 
-report: | setup-station ## a page of recordings: paths, commands, hops, latency: make report FILE=run.mcap|"log-*.rec" [OUT=page.html]
+report: | setup-station ## write a page of plots from recordings | FILE=run.mcap|"log-*.rec" [OUT=page.html]
 	$(Q)$(FLOTILLA) report $(call option,--out,OUT) $(call need_each,FILE)
 
-param: | setup ## parameters of a task or an app that runs: make param ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5 [CONFIRM=old]]]
+param: | setup ## list or set the parameters of a running task or app | ROBOT=1 TASK=heading [PARAM=attitude.kp [VALUE=2.5 [CONFIRM=old]]]
 	$(Q)$(FLOTILLA) param $(call option,--confirm,CONFIRM) $(call need,ROBOT) $(call need,TASK) $(if $(value PARAM),$(call given,PARAM) $(call option,--,VALUE))
 
-scope: | setup ## signals of a task that runs: ROBOT=1 TASK=heading [SIGNALS="gyro.rate"] [EVERY= ROWS= TRIGGER='gyro.rate>0.1' BEFORE=] [CSV=file]
+scope: | setup ## show or record the signals of a running task | ROBOT=1 TASK=heading [SIGNALS="gyro.rate"] [EVERY=5] [ROWS=20] [TRIGGER='gyro.rate>0.1'] [BEFORE=10] [CSV=file]
 	$(Q)$(FLOTILLA) scope $(call need,ROBOT) $(call option,--every,EVERY) $(call option,--rows,ROWS) $(call option,--trigger,TRIGGER) \
 	    $(call option,--before,BEFORE) $(call option,--csv,CSV) -- $(call need,TASK) $(call each_given,SIGNALS)
 
@@ -336,31 +336,31 @@ scope: | setup ## signals of a task that runs: ROBOT=1 TASK=heading [SIGNALS="gy
 .PHONY: latency latency-accept boot-time hwcheck accept scenarios scenarios-accept
 # What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.
 measured = $(call option,--board,BOARD) $(call option,--kernel,KERNEL) $(call option,--plan,PLAN)
-latency: | setup-lab setup-runtime ## latency in virtual time against the accepted run, or limits (an hour): PLAN=standard [BOARD= KERNEL=lean|debian|no-rt PLAN=disk]; or TARGET=ssh:robot3
+latency: | setup-lab setup-runtime ## measure latency in virtual time; compare with a baseline | [PLAN=quick|standard|disk] [BOARD=x86_64] [KERNEL=lean|debian|no-rt] [TARGET=ssh:robot3]
 	$(Q)$(FLOTILLA) latency $(measured) $(call option,--target,TARGET)
 
-hwcheck: | setup ## a robot's hardware in one file, to send with a bug report: make hwcheck ROBOT=3
+hwcheck: | setup ## write a robot's hardware to a file for a bug report | ROBOT=3 [SECONDS=60]
 	$(Q)$(FLOTILLA) hwcheck $(call need,ROBOT) $(call option,--seconds,SECONDS)
 
-accept: | setup-station setup-lab setup-runtime ## is a robot what its board's file asks: a signed report: make accept ROBOT=3 [PLAN=standard|quick|none SECONDS=60 RELAYS=1 WATCHDOG=1]
+accept: | setup-station setup-lab setup-runtime ## test a robot's hardware and write a signed report | ROBOT=3 [PLAN=standard|quick|none] [SECONDS=60] [RELAYS=1] [WATCHDOG=1]
 	$(Q)$(FLOTILLA) accept $(call need,ROBOT) $(call option,--plan,PLAN) $(call option,--seconds,SECONDS) $(if $(filter-out 0,$(RELAYS)),--relays) \
 	    $(if $(filter-out 0,$(WATCHDOG)),--watchdog)
 
-latency-accept: | setup-lab setup-runtime ## measure both kernels, or KERNEL=, and a control loop, and make that the accepted latency [BOARD=]
+latency-accept: | setup-lab setup-runtime ## measure latency and store it as the new baseline | [BOARD=x86_64] [KERNEL=lean|debian] [PLAN=quick]
 	$(Q)$(FLOTILLA) latency-accept $(measured)
 
-boot-time: | setup-lab setup-runtime ## where a boot spends its time, in virtual time
+boot-time: | setup-lab setup-runtime ## measure the steps of a boot in virtual time | [BOARD=x86_64] [KERNEL=lean|debian] [PLAN=quick]
 	$(Q)$(FLOTILLA) boot-time $(measured)
 
-scenarios: | setup-station setup-lab setup-runtime ## a robot flown by four computers, links that lose or are cut: a report [SIDE=0.03; published: 1] [FLIGHTS="udp dds" | all] [BOARD=] [ON=guests [LINK=ibss] | ON=lockstep | ROBOTS=16]
+scenarios: | setup-station setup-lab setup-runtime ## simulate robots with packet loss and link failures | [SIDE=0.03] [FLIGHTS="udp dds"|all] [BOARD=x86_64] [ON=guests|lockstep] [LINK=ibss] [ROBOTS=16]
 	$(Q)$(FLOTILLA) scenarios $(addprefix --,$(filter guests lockstep,$(ON))) $(call option,--link,LINK) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
 
-scenarios-accept: | setup-station setup-lab setup-runtime ## make a new run the accepted one: commit lab/scenarios/baseline.json
+scenarios-accept: | setup-station setup-lab setup-runtime ## fly the scenarios and store them as the new baseline
 	$(Q)$(FLOTILLA) scenarios-accept
 
 ##@ Housekeeping
 .PHONY: setup setup-station setup-lab setup-runtime setup-tests clean help
-setup: $(VENV)/.build ## install what building needs
+setup: $(VENV)/.build ## install what `make image` needs
 
 # Git, or the program that unpacked an archive, may have ended lines with CR LF, which shells do not accept.
 $(if $(shell grep -l "$$(printf '\r')" images/install-host-packages Makefile),$(error the files of this checkout end their \
@@ -381,35 +381,39 @@ $(VENV)/.station: requirements/station.lock $(VENV)/.build
 $(VENV)/.tests: requirements/tests.lock requirements/tests-source.lock $(VENV)/.station
 	$(set_up)
 
-setup-station: $(VENV)/.station ## install what a station needs: its page, recordings and reports
+setup-station: $(VENV)/.station ## install what a station needs: page, recordings, reports
 
 # Each command installs what it needs: guests, the runtime for this computer, a browser for the tests of pages.
-setup-lab: setup ## install what guests need
+setup-lab: setup ## install what QEMU guests need
 	$(Q)images/install-host-packages tests/lab-packages.txt
 
-setup-runtime: setup ## install what the runtime for this computer needs
+setup-runtime: setup ## install what compiling the runtime needs
 	$(Q)images/install-host-packages tests/runtime-packages.txt
 
-setup-tests: $(VENV)/.tests ## install what testing needs
+setup-tests: $(VENV)/.tests ## install what the tests need
 	$(Q)images/install-host-packages tests/host-packages.txt tests/lab-packages.txt tests/runtime-packages.txt
 
-clean: ## remove all outputs; keys stay
+clean: ## remove all outputs except keys
 	$(Q)rm -rf $(BUILD)
 
-help: ## this list
-	@awk -F ':.*## ' '/^##@/ {printf "\n%s\n", substr($$0, 5)} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2} \
-	    /^##= / {print "  " substr($$0, 5)}' $(MAKEFILE_LIST)
+help: ## show this list, or the variables of one target | [TARGET=flash]
+	@awk -v target=$(call given,TARGET) -F ':.*## ' 'BEGIN {if (!target) print "The variables of one target: make help TARGET=flash"} \
+	    /^##@ / && !target {printf "\n%s\n", substr($$0, 5)} /^##= / && !target {print "  " substr($$0, 5)} \
+	    /^[a-z-]+:.*## / {split($$2, text, " [|] ")} \
+	    /^[a-z-]+:.*## / && !target {printf "  %-17s%s\n", $$1, text[1]} \
+	    /^[a-z-]+:.*## / && $$1 == target {printf "make %s %s\n    %s\n", $$1, text[2], text[1]; found = 1} \
+	    END {if (target && !found) {print "TARGET=" target ": no such target; see make help" >"/dev/stderr"; exit 2}}' $(MAKEFILE_LIST)
 
 ##@ Variables of all targets
-##= MIRROR=           Debian mirror; by default the one of this computer's apt, on other systems Debian's own
-##= SECURITY_MIRROR=  the same for security updates
-##= SNAPSHOT=         snapshot archive for locked packages that left the mirror
-##= BUILD=            where outputs go instead of build/
-##= KEYS=             where keys are instead of ansible/keys/
-##= APPS=             where apps are instead of apps/
-##= INVENTORY=        the fleet's description instead of ansible/inventory/; wheeled, scenarios and tests have their own
-##= ANY_HOST=1        set up a computer that is none of the supported hosts
-##= PYTHON3=          the Python that builds, instead of python3 of the path or of the system
+##= MIRROR=           Debian mirror; default: the one in this computer's apt files
+##= SECURITY_MIRROR=  Debian mirror of security updates; default as above
+##= SNAPSHOT=         snapshot archive, for locked packages that left the mirror
+##= BUILD=            directory of outputs; default: build/
+##= KEYS=             directory of keys; default: ansible/keys/
+##= APPS=             directory of apps; default: apps/
+##= INVENTORY=        directory of the inventory; default: ansible/inventory/
+##= ANY_HOST=1        also set up a computer that is not a supported host
+##= PYTHON3=          Python interpreter; default: python3
 ##= V=1               show the commands
 
 comma := ,

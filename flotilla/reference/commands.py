@@ -61,7 +61,11 @@ def _targets() -> str:
             text += table((title, "meaning"), rows) if rows else ""
             text += f"\n### {line[4:]}\n\n" if line[4:] else ""
             rows = []
-        elif match := re.match(r"([a-z-]+):.*## (.*)", line) or re.match(r"##= (\S+) +(.*)", line):
-            title = "variable" if line.startswith("##=") else "target"
+        elif match := re.match(r"##= (\S+) +(.*)", line):
+            title = "variable"
             rows.append((code(match[1]), literal(match[2])))
+        elif match := re.match(r"([a-z-]+):.*## (.*)", line):
+            title = "command"
+            meaning, _, variables = match[2].partition(" | ")
+            rows.append((code(f"make {match[1]} {variables}".rstrip()), literal(meaning)))
     return text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import itertools
 import json
 import os
 import re
@@ -142,6 +143,46 @@ def test_each_variable_is_defined_once() -> None:
     defined = re.findall(r"^([A-Za-z_]+) *[:?]?= ", (paths.PROJECT / "Makefile").read_text(), re.MULTILINE)
     assert {name for name in defined if defined.count(name) > 1} == set()
     assert "COSTS" in defined
+
+
+def make_help(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["make", "-C", str(paths.PROJECT), "-s", "help", *words], capture_output=True, text=True, check=False
+    )
+
+
+def test_help_fits_a_terminal() -> None:
+    """Seen to fail: 51 of 96 lines were longer, the longest 197 characters."""
+    lines = make_help().stdout.splitlines()
+    assert "  flash            write a card and read it back" in lines
+    assert [line for line in lines if len(line) > 80] == []
+
+
+def test_help_of_a_target_has_each_variable_that_it_uses() -> None:
+    """Seen to fail: ten targets had variables that were written nowhere, such as FORCE of flash."""
+    lines = (paths.PROJECT / "Makefile").read_text().replace("\\\n", " ").splitlines()
+    variables = dict(re.findall(r"^(\w+) *[:?]?= *(.*)$", "\n".join(lines), re.MULTILINE))
+    of_all = set(re.findall(r"^##= (\w+)", "\n".join(lines), re.MULTILINE))
+    missing = {}
+    for at, line in enumerate(lines):
+        if not (target := re.match(r"([a-z-]+):.*## ", line)):
+            continue
+        recipe = "\n".join(itertools.takewhile(lambda each: each.startswith("\t"), lines[at + 1 :]))
+        for name in re.findall(r"\$\((\w+)\)", recipe):
+            recipe += variables.get(name, "")
+        used = set(re.findall(r"call (?:option,[^,)]*|need|given|each_given|need_each|value),?([A-Z_]+)\)", recipe))
+        used |= set(re.findall(r"\$\(filter(?:-out)? [\w ]*,\$\(([A-Z]+)\)", recipe))
+        done = make_help(f"TARGET={target[1]}")
+        assert done.returncode == 0
+        if unnamed := used - of_all - set(re.findall(r"[A-Z_]+\b", done.stdout)):
+            missing[target[1]] = unnamed
+    assert not missing, str(missing)
+
+
+def test_help_of_an_unknown_target_is_an_error() -> None:
+    done = make_help("TARGET=flush")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "TARGET=flush: no such target; see make help" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["BUILD", "KEYS", "APPS", "INVENTORY"])
