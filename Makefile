@@ -355,7 +355,7 @@ boot-time: | setup-lab setup-runtime ## measure the steps of a boot in virtual t
 scenarios: | setup-station setup-lab setup-runtime ## simulate robots with packet loss and link failures | [SIDE=0.03] [FLIGHTS="udp dds"|all] [BOARD=x86_64] [ON=guests|lockstep] [LINK=ibss] [ROBOTS=16]
 	$(Q)$(FLOTILLA) scenarios $(addprefix --,$(filter guests lockstep,$(ON))) $(call option,--link,LINK) $(call option,--robots,ROBOTS) $(call option,--side,SIDE) $(call option,--board,BOARD) $(call each_given,FLIGHTS)
 
-scenarios-accept: | setup-station setup-lab setup-runtime ## fly the scenarios and store them as the new baseline
+scenarios-accept: | setup-station setup-lab setup-runtime ## run the scenarios and store them as the new baseline
 	$(Q)$(FLOTILLA) scenarios-accept
 
 ##@ Housekeeping

@@ -25,6 +25,8 @@ from images.builder import verify
 
 FILE = Path(__file__).with_suffix(".yml")
 WORK = paths.BUILD / "planted"
+_MISSING = re.compile(r"is missing; build it: make image ROBOT=(\d+)")
+"""Said by tests/conftest.py."""
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 
 
@@ -77,9 +79,17 @@ def noticed(fault: Fault, log: Path) -> str | None:
         status = run(python, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not nightly", *tests)
     if status == 0:
         return None
-    failed = _FAILED.search(log.read_text())
+    return first_failed(log)
+
+
+def first_failed(log: Path) -> str:
+    """Of a run that failed. A test whose card nobody built has noticed nothing."""
+    said = log.read_text()
+    if missing := _MISSING.search(said):
+        raise UserError(f"planted.yml: images: robot {missing[1]} is missing, whose card {paths.shown(log)} asks for")
+    failed = _FAILED.search(said)
     if not failed:
-        raise UserError(f"pytest ended with status {status} without a failed test: see {paths.shown(log)}")
+        raise UserError(f"pytest failed without a failed test: see {paths.shown(log)}")
     return failed[1]
 
 
