@@ -1,25 +1,28 @@
 # Front door. `make help` lists the targets; V=1 shows the commands.
-BUILD ?= build
+# A fleet's home has outputs of its own; the Python environment is the checkout's.
+VENV := $(or $(value BUILD),build)/venv
+ifeq ($(value BUILD),)
+BUILD := $(if $(value FLEET),$(value FLEET)/build,build)
+endif
 # Paths that stand in commands as they are; flotilla/common/paths.py has the same characters.
 not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$ : % = \#
 in_path = $(strip $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1)))
 unfit = a path with blanks or with a character that means something to a shell;
 $(if $(call in_path,CURDIR),$(error $(CURDIR): this checkout lies on $(unfit) move it))
-$(foreach name,BUILD KEYS APPS INVENTORY,$(if $(call in_path,$(name)),$(error $(name)=$(value $(name)): is $(unfit) \
+$(foreach name,FLEET BUILD KEYS APPS INVENTORY,$(if $(call in_path,$(name)),$(error $(name)=$(value $(name)): is $(unfit) \
     take another directory)))
 export BUILD
 # Names of files are UTF-8 in any user's locale: the virtual environment has the path of the checkout in its files.
 export LC_ALL := C.UTF-8
-VENV := $(BUILD)/venv
 PYTHON := $(VENV)/bin/python
 FLOTILLA := $(PYTHON) -m flotilla
 # A part of a command: a line that moves on a terminal, a line at its end without one; what it says when it fails.
 step = $(PYTHON) -m flotilla.common.progress
 Q := $(if $(filter-out 0,$(V)),,@)
-export V MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS INVENTORY PART PYTHON3
+export V FLEET MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS INVENTORY PART PYTHON3
 # Of these the fleet is fixed; nobody shall think that it was another.
-$(if $(and $(value INVENTORY),$(filter wheeled wheeled-down scenarios check test test-all,$(MAKECMDGOALS))),$(error \
-    INVENTORY=$(value INVENTORY): $(MAKECMDGOALS) has a fleet of its own; leave INVENTORY out))
+$(foreach name,FLEET INVENTORY,$(if $(and $(value $(name)),$(filter wheeled wheeled-down scenarios check test test-all,\
+    $(MAKECMDGOALS))),$(error $(name)=$(value $(name)): $(MAKECMDGOALS) has a fleet of its own; leave $(name) out)))
 # Python imports no packages of the user's, and pip puts none among them.
 unexport PYTHONHOME PYTHONPATH PIP_PREFIX PIP_TARGET PIP_USER
 MAKEFLAGS += --no-print-directory
@@ -116,7 +119,10 @@ deploy: | setup ## build an app, copy it to a robot and start it | ROBOT=3 APP=d
 	    $(if $(filter-out 0,$(KEEP)),--keep) $(if $(filter-out 0,$(ON_ROBOT)),--on-robot)
 
 ##@ Inputs
-.PHONY: lock cve check-fleet requirements
+.PHONY: init lock cve check-fleet requirements
+init: | setup ## make a directory for a fleet of your own | FLEET=dir
+	$(Q)$(FLOTILLA) init $(call need,FLEET)
+
 lock: | setup ## resolve package lists to exact versions and hashes | [ONLY=lock]
 	$(Q)$(FLOTILLA) lock $(call option,--only,ONLY)
 
@@ -408,10 +414,11 @@ help: ## show this list, or the variables of one target | [TARGET=flash]
 ##= MIRROR=           Debian mirror; default: the one in this computer's apt files
 ##= SECURITY_MIRROR=  Debian mirror of security updates; default as above
 ##= SNAPSHOT=         snapshot archive, for locked packages that left the mirror
+##= FLEET=            directory of your fleet; default: the example fleet
 ##= BUILD=            directory of outputs; default: build/
-##= KEYS=             directory of keys; default: ansible/keys/
+##= KEYS=             directory of keys; default: keys/ of FLEET, or ansible/keys/
 ##= APPS=             directory of apps; default: apps/
-##= INVENTORY=        directory of the inventory; default: ansible/inventory/
+##= INVENTORY=        directory of the inventory; default: that of FLEET
 ##= ANY_HOST=1        also set up a computer that is not a supported host
 ##= PYTHON3=          Python interpreter; default: python3
 ##= V=1               show the commands

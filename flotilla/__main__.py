@@ -6,10 +6,18 @@ import codecs
 import io
 import locale
 import os
+import re
 import select
 import sys
+from pathlib import Path
 
-from flotilla.cli.main import main
+
+def main() -> int:
+    """Run the command line: imported when the home is known, because places are read from the environment once."""
+    from flotilla.cli.main import main
+
+    return main()
+
 
 BROKEN_PIPE = 141
 """As a shell reports a program that SIGPIPE ended."""
@@ -18,6 +26,7 @@ BROKEN_PIPE = 141
 def program() -> int:
     """Run the command line; the exit status."""
     _use_utf8()
+    _find_home()
     try:
         try:
             return main()
@@ -44,6 +53,19 @@ def _use_utf8() -> None:
         if isinstance(stream, io.TextIOWrapper):
             # The locale C says nothing of the terminal.
             stream.reconfigure(encoding=None if given or encoding == "ascii" else encoding, errors="replace")
+
+
+def _find_home() -> None:
+    """A command in a fleet's home, or below it, is about that fleet."""
+    if "FLEET" in os.environ:
+        return
+    here = Path.cwd()
+    for directory in (here, *here.parents):
+        file = directory / "fleet.yml"
+        # A playbook may have this name, too.
+        if file.is_file() and re.search(rb"(?m)^flotilla:", file.read_bytes()):
+            os.environ["FLEET"] = str(directory)
+            return
 
 
 def _reader_left(fd: int) -> bool:

@@ -404,6 +404,16 @@ def _scope_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a table there")
 
 
+def _init(arguments: argparse.Namespace) -> None:
+    from flotilla.fleet import home
+
+    print(home.make(arguments.directory.absolute()))
+
+
+def _init_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("directory", type=Path, help="a new or empty one")
+
+
 def _new_app(arguments: argparse.Namespace) -> None:
     from flotilla.apps import scaffold
 
@@ -641,6 +651,7 @@ COMMANDS = (
     Command("Cards", "size", "show the largest packages and files of a robot's image", _size, robot_argument),
     Command("Cards", "bundle", "make the update bundle of a board", _bundle, _bundle_arguments),
     Command("Cards", "bench", "measure builds against other builders", _bench, _bench_arguments),
+    Command("Inputs", "init", "make a home for a fleet of your own", _init, _init_arguments),
     Command("Inputs", "check-fleet", "check the fleet's description", _check_fleet),
     Command("Inputs", "lock", "resolve the package lists to exact versions", _lock, _lock_arguments),
     Command("Inputs", "cve", "name known vulnerabilities of what the locks hold", _cve, _cve_arguments),

@@ -20,12 +20,14 @@ import stat
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
+from typing import TypeVar
 
 from flotilla.common import durable, host, paths, progress, sources
 
+_Name = TypeVar("_Name", bound=PurePath)
 _KEPT = 4
 """The newest results of a kind, which stay whoever used them: with two boards, the present one and the one before."""
 _IN_USE_S = 3600
@@ -54,9 +56,14 @@ def digest(*parts: str | bytes | Path) -> str:
 
 def digest_of(directory: Path, files: Iterable[Path]) -> str:
     """SHA-256 over some of the files below a directory, with their paths from there and executable bits."""
+    return digest_of_named({path.relative_to(directory): path for path in files})
+
+
+def digest_of_named(files: Mapping[_Name, Path]) -> str:
+    """The same over files of several directories, by the paths that count."""
     total = hashlib.sha256()
-    for path in files:
-        total.update(_entry(path, os.fsencode(path.relative_to(directory))))
+    for name, path in files.items():
+        total.update(_entry(path, os.fsencode(name)))
     return total.hexdigest()
 
 

@@ -141,7 +141,7 @@ def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
         "TZ": "UTC",
         "PYTHONPATH": str(paths.PROJECT),
     }
-    environment |= {name: os.environ[name] for name in ("BUILD", "V") if name in os.environ} | moved_clock()
+    environment |= {name: os.environ[name] for name in ("FLEET", "BUILD", "V") if name in os.environ} | moved_clock()
     run_logged(module, argv, log, environment)
 
 

@@ -1,5 +1,18 @@
-"""Where things lie. Every other module asks here; `BUILD`, `KEYS`, `APPS` and `INVENTORY` come from the
-environment."""
+"""Where things lie. Every other module asks here; `FLEET`, `BUILD`, `KEYS`, `APPS` and `INVENTORY` come from the
+environment.
+
+A fleet has a home: a directory that its owner keeps in a repository of its own. `FLEET` names it; without `FLEET` it is
+this checkout, with the example fleet.
+
+| in a home | in the checkout |
+|---|---|
+| `inventory/`, `control_tasks/` | `ansible/inventory/`, `ansible/control_tasks/` |
+| `apps/`, `build/` | `apps/`, `build/` |
+| `keys/` | `ansible/keys/` |
+| `overlay/`, `packages/`, `locks/`, `kernel/` | `rootfs_overlay/`, `images/packages/`, `images/locks/`, `kernel/` |
+
+The folders of the last row contain only what differs: `flotilla.common.sources.find` takes each other file from the
+checkout."""
 
 from __future__ import annotations
 
@@ -10,9 +23,22 @@ from pathlib import Path
 from flotilla.common.errors import UserError
 
 PROJECT = Path(__file__).resolve().parents[2]
-BUILD = Path(os.environ.get("BUILD") or PROJECT / "build").resolve()
+HOME = Path(os.environ.get("FLEET") or PROJECT).resolve()
+"""The fleet's home."""
+OWN_HOME = HOME != PROJECT
+"""Whether the fleet lies outside of this checkout."""
+HOME_FILE = "fleet.yml"
+"""The file that makes a directory a home; a home that is this checkout has none."""
+
+
+def _place(variable: str, in_home: str, in_checkout: str) -> Path:
+    """What the environment names, or else the usual place."""
+    return Path(os.environ.get(variable) or HOME / (in_home if OWN_HOME else in_checkout)).resolve()
+
+
+BUILD = _place("BUILD", "build", "build")
 """All outputs. Removing it loses nothing that cannot be made again."""
-KEYS = Path(os.environ.get("KEYS") or PROJECT / "ansible" / "keys").resolve()
+KEYS = _place("KEYS", "keys", "ansible/keys")
 """Private keys: made once, never in git, never removed by `make clean`."""
 
 POOL = BUILD / "pool"
@@ -28,13 +54,15 @@ OPERATORS = BUILD / "operators"
 GUESTS = BUILD / "fleet" / "guests.yml"
 """Ansible's inventory of the virtual fleet, while it runs."""
 
-INVENTORY = Path(os.environ.get("INVENTORY") or PROJECT / "ansible" / "inventory").resolve()
+INVENTORY = _place("INVENTORY", "inventory", "ansible/inventory")
 """The fleet's description, of every command that is about robots."""
-TASKS = PROJECT / "ansible" / "control_tasks"
+BOARDS = PROJECT / "ansible" / "boards"
+"""The boards that come with this tool, as an inventory without hosts."""
+TASKS = HOME / "control_tasks" if OWN_HOME else PROJECT / "ansible" / "control_tasks"
 """Control tasks that the inventory gives to robots."""
 MESSAGES = "messages.yml"
 """The file there that is no task: what tasks send each other and the stations."""
-APPS = Path(os.environ.get("APPS") or PROJECT / "apps").resolve()
+APPS = _place("APPS", "apps", "apps")
 """Apps of one's own, a directory each: those that the inventory names."""
 OVERLAY = PROJECT / "rootfs_overlay"
 PACKAGES = PROJECT / "images" / "packages"
@@ -50,10 +78,12 @@ SSH's options read something else in them, and not all of these have a way to qu
 
 def check() -> None:
     """Refuse places where some program of a build or of a playbook would take another path than the one meant."""
-    given = {"": PROJECT, "BUILD=": BUILD, "KEYS=": KEYS, "APPS=": APPS, "INVENTORY=": INVENTORY}
+    given = {"": PROJECT, "FLEET=": HOME, "BUILD=": BUILD, "KEYS=": KEYS, "APPS=": APPS, "INVENTORY=": INVENTORY}
     unfit = {name: path for name, path in given.items() if _unfit(path)}
     if "" in unfit:  # then all that is inside is, too
         unfit = {name: path for name, path in unfit.items() if not name or not path.is_relative_to(PROJECT)}
+    if "FLEET=" in unfit:
+        unfit = {name: path for name, path in unfit.items() if name in ("", "FLEET=") or not path.is_relative_to(HOME)}
     if unfit:
         raise UserError("\n".join(f"{name}{str(path)!a}: {_REMEDY[not name]}" for name, path in unfit.items()))
 

@@ -10,7 +10,7 @@ import fnmatch
 import os
 import stat
 from collections.abc import Iterable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
@@ -48,6 +48,36 @@ def files(directory: Path) -> list[Path]:
         else:
             raise UserError(f"{paths.shown(path)}: is neither a file nor a link nor a directory; remove it")
     return found
+
+
+_IN_HOME = {"rootfs_overlay": "overlay"}
+"""Names of the tool's folders that have another name in a fleet's home."""
+
+
+def layers(directory: Path) -> list[Path]:
+    """The folders whose files count: the fleet's own, where it has a home with such a folder, and one of the tool's."""
+    return [each for each in dict.fromkeys((own(directory), directory)) if each.is_dir()]
+
+
+def own(directory: Path) -> Path:
+    """The fleet's own folder in place of one of the tool's; it need not exist. Without a home it is the tool's."""
+    return paths.HOME / _IN_HOME.get(directory.name, directory.name) if paths.OWN_HOME else directory
+
+
+def find(directory: Path, name: str | PurePosixPath) -> Path:
+    """A file of a folder of the tool's, or the fleet's own in its place; where neither exists, the fleet's own."""
+    found = [layer / name for layer in layers(directory)]
+    return next((path for path in found if path.is_file() or path.is_symlink()), own(directory) / name)
+
+
+def layered(directory: Path) -> dict[PurePosixPath, Path]:
+    """The files of a folder of the tool's by their path in it, in order, with the fleet's own in their place."""
+    found = {
+        PurePosixPath(path.relative_to(layer)): path
+        for layer in reversed(layers(directory))
+        for path in files(layer)
+    }  # fmt: skip
+    return dict(sorted(found.items(), key=lambda item: item[0].parts))
 
 
 def strays(directory: Path) -> dict[Path, str]:

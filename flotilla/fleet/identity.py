@@ -81,9 +81,9 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
     }
 
 
-def templates() -> list[Path]:
-    """The overlay's files that are rendered for each robot."""
-    return [path for path in sources.files(paths.OVERLAY) if path.suffix == ".j2"]
+def templates() -> dict[PurePosixPath, Path]:
+    """The overlay's files that are rendered for each robot, by their path in it."""
+    return {name: path for name, path in sources.layered(paths.OVERLAY).items() if name.suffix == ".j2"}
 
 
 @functools.cache
@@ -91,7 +91,7 @@ def _environment() -> jinja2.Environment:
     import jinja2  # here, because it takes a while, in which the build has other things to do
 
     return jinja2.Environment(
-        loader=jinja2.FileSystemLoader([paths.OVERLAY, paths.TASKS]),
+        loader=jinja2.FileSystemLoader([*sources.layers(paths.OVERLAY), paths.TASKS]),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -114,8 +114,7 @@ def render(fleet: Fleet, robot: Robot, built: Sequence[BuiltApp] = ()) -> dict[P
     descriptions = {name: description for name, (_, description) in tasks.items()}
     values = variables(fleet, robot) | {"device_users": privileges.device_users(descriptions)}
     files = {}
-    for template in templates():
-        name = PurePosixPath(template.relative_to(paths.OVERLAY))
+    for name, template in templates().items():
         each: dict[PurePosixPath, dict[str, object]] = {name.with_suffix(""): {}}
         if name == _CAN:
             each = {_CAN.with_name(f"20-{can}.network"): {"can": can, "bus": bus} for can, bus in robot.can.items()}
@@ -174,7 +173,7 @@ def _problems_of_processor(task: object, board: Board) -> list[str]:
 
 def interrupt_priorities() -> dict[str, int]:
     """Priorities of interrupt threads on robots, by the pattern of their names."""
-    lines = (paths.OVERLAY / "etc/flotilla/irq-priorities").read_text(encoding="utf-8").splitlines()
+    lines = sources.find(paths.OVERLAY, "etc/flotilla/irq-priorities").read_text(encoding="utf-8").splitlines()
     return {(words := line.split())[0]: int(words[1]) for line in lines if line and not line.startswith("#")}
 
 

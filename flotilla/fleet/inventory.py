@@ -25,8 +25,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from flotilla.common import ansible, cache, durable, paths
 from flotilla.common.errors import Problem, ProblemsError, UserError
+from flotilla.common.sources import find
 from flotilla.common.yaml_file import SYNTAX, Entry, Loc, child, compose, did_you_mean, dotted, explained, pairs
-from flotilla.fleet import apps, messages, privileges
+from flotilla.fleet import apps, home, messages, privileges
 from flotilla.fleet.model import Board, Fleet, Health, Host, Label, Network, Releases, Robot
 
 Finding = tuple[Loc, str, str]
@@ -43,20 +44,27 @@ _VARIABLES = {"address", *_OF_ROBOTS, *_HOMES}
 
 
 def load_fleet(directory: Path | None = None) -> Fleet:
-    """The fleet of an inventory, by default the project's; or ProblemsError with all that is wrong in it."""
+    """The fleet of an inventory, by default that of the fleet's home; or ProblemsError with all that is wrong in it."""
     paths.check()  # for playbooks, too
+    home.check()
     directory = directory or paths.INVENTORY
     if not directory.is_dir():
         remedy = "name one with robots.yml and group_vars/"
         raise UserError(f"INVENTORY={paths.shown(directory)}: there is no such directory; {remedy}")
-    sources = Sources(directory)
+    places = layers(directory)
+    sources = Sources(*places)
     try:
-        merged = _merged(directory)
+        merged = _merged(places)
     except UserError:
         if sources.problems:  # they say more than Ansible does
             raise ProblemsError(sources.problems) from None
         raise
     return validate(merged, sources)
+
+
+def layers(directory: Path) -> list[Path]:
+    """What Ansible reads, the weakest first: a fleet's own inventory lies over the boards that come with the tool."""
+    return [paths.BOARDS, directory] if paths.OWN_HOME and directory == paths.INVENTORY else [directory]
 
 
 def robot(fleet: Fleet, number: int) -> Robot:
@@ -105,23 +113,28 @@ def summary(fleet: Fleet) -> str:
 # What Ansible says
 
 
-def _merged(directory: Path) -> dict[str, Any]:
+def _merged(places: Sequence[Path]) -> dict[str, Any]:
     """Output of `ansible-inventory --list`, kept under the hash of the inventory: Ansible takes a second to start."""
     # By what Ansible reads: a link leads to what it reads.
-    files = [file for file in sorted(directory.rglob("*")) if file.is_file()]
-    contents = [part for file in files for part in (str(file.relative_to(directory)), file.read_bytes())]
+    contents = [
+        part
+        for place in places
+        for file in sorted(place.rglob("*"))
+        if file.is_file()
+        for part in (str(file.relative_to(place)), file.read_bytes())
+    ]
     kept = paths.CACHE / f"inventory-{cache.digest(version('ansible-core'), *contents)}.json"
     try:
         merged: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):  # or cut short by a power cut
-        text = _ansible_inventory(directory)
+        text = _ansible_inventory(places)
         kept.parent.mkdir(parents=True, exist_ok=True)
         durable.write(kept, text)
         merged = json.loads(text)
     return merged
 
 
-def _ansible_inventory(directory: Path) -> str:
+def _ansible_inventory(places: Sequence[Path]) -> str:
     """Ansible's answer depends on the inventory alone: no configuration of the user's, no variables."""
     program = Path(sys.executable).with_name("ansible-inventory")
     home = paths.CACHE / "ansible"
@@ -133,7 +146,7 @@ def _ansible_inventory(directory: Path) -> str:
         "ANSIBLE_HOME": str(home),
         "ANSIBLE_INVENTORY_ANY_UNPARSED_IS_FAILED": "1",
     }
-    argv = [str(program), "-i", str(directory), "--list"]
+    argv = [str(program), *(word for place in places for word in ("-i", str(place))), "--list"]
     try:
         done = subprocess.run(
             argv, env=environment, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", check=False
@@ -142,7 +155,7 @@ def _ansible_inventory(directory: Path) -> str:
         raise UserError(f"{program}: not installed; run `make setup`") from None
     if done.returncode:
         message = done.stderr.partition("Traceback")[0].strip()
-        raise UserError(f"{paths.shown(directory)}: Ansible cannot read the inventory:\n{message}")
+        raise UserError(f"{paths.shown(places[-1])}: Ansible cannot read the inventory:\n{message}")
     return done.stdout
 
 
@@ -152,14 +165,16 @@ def _ansible_inventory(directory: Path) -> str:
 class Sources:
     """The inventory's YAML files: where each variable stands, and the problems that only they show."""
 
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
+    def __init__(self, *places: Path) -> None:
+        """`places`: the weakest first."""
+        self.directory = places[-1]
         self.problems: list[Problem] = []
         self._entries: dict[Scope, list[Entry]] = {}
         """In each scope later files override earlier ones, as in Ansible."""
-        for path in sorted(directory.rglob("*")):
-            if path.suffix in (".yml", ".yaml", ".json") and path.is_file():
-                self._read(path)
+        for place in places:
+            for path in sorted(place.rglob("*")):
+                if path.suffix in (".yml", ".yaml", ".json") and path.is_file():
+                    self._read(place, path)
         if any(problem.key == SYNTAX for problem in self.problems):  # Ansible could not read it either
             raise ProblemsError(self.problems)
         for (kind, name), entries in self._entries.items():
@@ -190,7 +205,7 @@ class Sources:
                 return yaml.SafeLoader("").construct_document(found[1])
         return None
 
-    def _read(self, path: Path) -> None:
+    def _read(self, place: Path, path: Path) -> None:
         entry = compose(path)
         if isinstance(entry, Problem):
             self.problems.append(entry)
@@ -198,7 +213,7 @@ class Sources:
             return
         # A host's path begins with its name, wherever its group stands.
         self.problems += entry.twice(entry.node, unnamed=("hosts", "children", "vars"))
-        kind, name, *_ = (*path.relative_to(self.directory).with_suffix("").parts, "")
+        kind, name, *_ = (*path.relative_to(place).with_suffix("").parts, "")
         if kind in ("group_vars", "host_vars"):
             self._entries.setdefault((kind, name), []).append(entry)
         elif not child(entry.node, "plugin"):
@@ -606,7 +621,7 @@ def _boards(raw: dict[str, Any]) -> Iterator[Finding]:
 def _files_of_boards(raw: dict[str, Any]) -> Iterator[Finding]:
     """A board's further files, which have its name."""
     for name, board in raw["boards"].items():
-        packages, kernel = paths.PACKAGES / f"{name}.list", paths.KERNELS / f"{name}.yml"
+        packages, kernel = find(paths.PACKAGES, f"{name}.list"), find(paths.KERNELS, f"{name}.yml")
         if not packages.is_file():
             remedy = "copy another board's and name the board's kernel package in it"
             yield ("boards", name), f"has no package list {paths.shown(packages)}", remedy

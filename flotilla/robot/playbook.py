@@ -23,7 +23,8 @@ def play(playbook: str, *, robot: int | None, guests: bool, words: Sequence[str]
     if guests and not paths.GUESTS.exists():
         raise UserError(f"{paths.shown(paths.GUESTS)} is missing: no virtual fleet runs; start one: make fleet N=4")
     programs = Path(sys.executable).parent
-    argv = [str(programs / "ansible-playbook"), "-i", str(paths.INVENTORY)]
+    argv = [str(programs / "ansible-playbook")]
+    argv += [word for place in inventory.layers(paths.INVENTORY) for word in ("-i", str(place))]
     argv += ["-i", str(paths.GUESTS)] if guests else []
     if robot is not None:
         argv += ["-l", inventory.robot(inventory.load_fleet(), robot).name]
@@ -34,6 +35,7 @@ def play(playbook: str, *, robot: int | None, guests: bool, words: Sequence[str]
     os.chdir(ANSIBLE)
     environment = ansible.environment() | {
         "PATH": f"{programs}:{os.environ['PATH']}",
+        **({"FLEET": str(paths.HOME)} if paths.OWN_HOME else {}),
         "BUILD": str(paths.BUILD),
         "KEYS": str(paths.KEYS),
         "APPS": str(paths.APPS),

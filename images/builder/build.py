@@ -134,6 +134,7 @@ class _Common:
     ranges: Future[bmap.BlockMap]
     inputs: Future[str]
     source: Future[manifest.Source | str]
+    fleet_source: Future[manifest.Source | str]
 
     @classmethod
     def of(cls, made: BoardBuild, source: Future[manifest.Source | str], threads: ThreadPoolExecutor) -> _Common:
@@ -142,6 +143,7 @@ class _Common:
             threads.submit(bmap.block_map, image, card.extents(made.base)),
             threads.submit(manifest.inputs_of_board, made.board, (made.lock, made.tools_lock)),
             source,
+            threads.submit(manifest.of_home),
         )
 
 
@@ -205,7 +207,8 @@ def _robot_image(
         whole = manifest.hash_range(new, 0, card.SIZE).hexdigest()
         manifest.write(
             fleet, robot, (made.lock, made.tools_lock), made.manifest, board_inputs=common.inputs.result(),
-            nodes=nodes, source=common.source.result(), boot_loader=boot_loader, data=data_part,
+            nodes=nodes, source=common.source.result(),
+            fleet_source=common.fleet_source.result(), boot_loader=boot_loader, data=data_part,
             image=manifest.Part(name=final.name, bytes=card.SIZE, sha256=whole), extents=extents,
             apps=apps, beside=new,
         )  # fmt: skip

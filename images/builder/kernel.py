@@ -22,7 +22,7 @@ from pathlib import Path
 
 import pydantic
 
-from flotilla.common import cache, durable, host, namespace, paths, progress, yaml_file
+from flotilla.common import cache, durable, host, namespace, paths, progress, sources, yaml_file
 from flotilla.common.errors import Problem, ProblemsError, UserError
 from flotilla.fleet.model import Architecture, Board
 from images.builder import chroot, kernel_stage, pool, tools
@@ -109,7 +109,7 @@ class Kernel:
 
 def names() -> list[str]:
     """All kernels."""
-    return sorted(path.stem for path in paths.KERNELS.glob("*.yml"))
+    return sorted({path.stem for layer in sources.layers(paths.KERNELS) for path in layer.glob("*.yml")})
 
 
 def recipe(name: str) -> Recipe:
@@ -117,15 +117,16 @@ def recipe(name: str) -> Recipe:
     if name not in names():
         file = paths.shown(paths.KERNELS / f"{name}.yml")
         raise UserError(f"{file}: there is no such kernel; there are {', '.join(names())}")
-    return yaml_file.read(paths.KERNELS / f"{name}.yml", Recipe)
+    return yaml_file.read(sources.find(paths.KERNELS, f"{name}.yml"), Recipe)
 
 
 def board_kernel(board: Board) -> Kernel:
     """Our own kernel for a board: that of its name."""
     architecture = recipe(board.name).architecture
     if architecture != board.architecture:
+        file = paths.shown(sources.find(paths.KERNELS, f"{board.name}.yml"))
         raise UserError(
-            f"{paths.shown(paths.KERNELS / f'{board.name}.yml')}: architecture: {architecture}: the board's is "
+            f"{file}: architecture: {architecture}: the board's is "
             f"{board.architecture}; make them the same here or in group_vars/board_{board.name}.yml"
         )
     return build(board.name)
@@ -179,13 +180,13 @@ def wanted(name: str) -> dict[str, Option]:
     return merge(
         option
         for fragment in recipe(name).fragments
-        for option in read_fragment(paths.KERNELS / "fragments" / f"{fragment}.config")
+        for option in read_fragment(sources.find(paths.KERNELS, f"fragments/{fragment}.config"))
     )
 
 
 def patches(name: str) -> list[Path]:
     """The patches of a kernel's source."""
-    files = [paths.KERNELS / "patches" / f"{patch}.patch" for patch in recipe(name).patches]
+    files = [sources.find(paths.KERNELS, f"patches/{patch}.patch") for patch in recipe(name).patches]
     for file in files:
         if not file.is_file():
             there = ", ".join(sorted(each.stem for each in file.parent.glob("*.patch")))

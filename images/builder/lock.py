@@ -20,7 +20,7 @@ from urllib.parse import unquote
 
 import pydantic
 
-from flotilla.common import durable, paths, progress, yaml_file
+from flotilla.common import durable, paths, progress, sources, yaml_file
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Architecture, Board, System, Word
 from images.builder import mirror
@@ -71,7 +71,7 @@ class Recipe:
 def recipes(boards: Iterable[Board]) -> dict[str, Recipe]:
     """Of all locks by name: the boards', those of their runtimes and of this computer's, and those of locks.yml."""
     boards = list(boards)
-    path = paths.PACKAGES / "locks.yml"
+    path = sources.find(paths.PACKAGES, "locks.yml")
     file = yaml_file.read(path, File)
     found: dict[str, Recipe] = {}
     for board in boards:
@@ -197,7 +197,12 @@ _VALID = {
 
 
 def lock_file(name: str) -> Path:
-    return paths.LOCKS / f"{name}.lock"
+    return sources.find(paths.LOCKS, f"{name}.lock")
+
+
+def own_lock_file(name: str) -> Path:
+    """Where the lock is written: a fleet with a home of its own has its own."""
+    return sources.own(paths.LOCKS) / f"{name}.lock"
 
 
 def read_lock(name: str) -> Lock:
@@ -281,7 +286,7 @@ def _package(values: Sequence[str]) -> Package:
 
 def read_list(name: str) -> list[PackageRequest]:
     """A package list: `[kernel] PACKAGE # reason` a line."""
-    path = paths.PACKAGES / f"{name}.list"
+    path = sources.find(paths.PACKAGES, f"{name}.list")
     if not path.is_file():
         raise UserError(f"{paths.shown(path)}: is missing; write `PACKAGE # reason` lines, as in the other lists")
     requests = []
@@ -302,7 +307,7 @@ def requests(recipe: Recipe) -> list[PackageRequest]:
     """What the lists of a lock ask for."""
     asked = [request for each in recipe.lists for request in read_list(each)]
     if recipe.system and not any(request.kernel for request in asked):
-        path = paths.PACKAGES / f"{recipe.lists[-1]}.list"
+        path = sources.find(paths.PACKAGES, f"{recipe.lists[-1]}.list")
         raise UserError(f"{paths.shown(path)}: names no kernel; add a line `kernel linux-image-… # reason`")
     return asked
 
@@ -328,8 +333,8 @@ def update_locks(recipes: Mapping[str, Recipe], mirrors: Mirrors | None = None, 
     for name, recipe in recipes.items():
         with progress.step(f"lock of {name}"):
             new = resolve(name, recipe, mirrors, without)
-        path = lock_file(name)
-        old = read_lock(name) if path.is_file() else None
+        path = own_lock_file(name)
+        old = read_lock(name) if lock_file(name).is_file() else None
         if old and old.packages == new.packages and old.missing_suites == new.missing_suites:
             if new.current > old.current:
                 _write(path, dataclasses.replace(old, checked=new.current))

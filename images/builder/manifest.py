@@ -42,6 +42,8 @@ _ENTERING = (
     "ansible/control_tasks", "ansible/inventory", "apps", "flotilla", "images", "kernel", "rootfs_overlay", "runtime",
 )  # fmt: skip
 """Folders of the project whose files images are made of, or by."""
+_ENTERING_FROM_HOME = ("inventory", "control_tasks", "apps", "kernel", "overlay", "packages", "locks")
+"""The same of a fleet's home."""
 _SUBMODULE = "160000"
 _SHA1 = 40
 """Digits of git's names of objects, where it names them by SHA-1."""
@@ -151,6 +153,9 @@ class Manifest(_Model):
     """None where nobody knows."""
     source_unknown: str = ""
     """Why."""
+    fleet_source: Source | None = None
+    """The git checkout of the fleet's home, where it is not the tool's own."""
+    fleet_source_unknown: str = ""
     image: Part
     parts: list[Part]
     partitions: list[Partition]
@@ -397,6 +402,7 @@ def write(
     nodes: list[Node],
     apps: Sequence[BuiltApp],
     source: Source | str,
+    fleet_source: Source | str = "",
     boot_loader: Part,
     data: Part,
     image: Part,
@@ -406,7 +412,8 @@ def write(
     """Write the manifest and the bills of materials of `beside`, an image of which everything is known.
 
     `locks`: the board's and the build tools'. `common`: what `shared` made. `board_inputs`: what `inputs_of_board`
-    said. `source`: what `checkout` said.
+    said. `source`, `fleet_source`: what `checkout` returned for the tool and for the
+    fleet's home.
     """
     board = fleet.boards[robot.board]
     lock, tools_lock = locks
@@ -422,6 +429,8 @@ def write(
         inputs=inputs(board_inputs, nodes),
         source=None if isinstance(source, str) else source,
         source_unknown=source if isinstance(source, str) else "",
+        fleet_source=None if isinstance(fleet_source, str) else fleet_source,
+        fleet_source_unknown=fleet_source if isinstance(fleet_source, str) else "",
         image=image,
         parts=[boot_loader, *same.parts, data],
         partitions=partitions(board, card.disk_id(nodes), extents),
@@ -524,7 +533,12 @@ def hostvars(fleet: Fleet, robot: Robot) -> dict[str, JsonValue]:
     return own | shared
 
 
-def checkout(directory: Path = paths.PROJECT) -> Source | str:
+def of_home() -> Source | str:
+    """What `checkout` returns for the fleet's home; nothing where that is the tool's own checkout."""
+    return checkout(paths.HOME, _ENTERING_FROM_HOME) if paths.OWN_HOME else ""
+
+
+def checkout(directory: Path = paths.PROJECT, entering: Sequence[str] = _ENTERING) -> Source | str:
     """Commit and cleanliness of the checkout that `directory` is the top of; why they are unknown otherwise.
 
     Another user may own the checkout. So no command of git's reads more than its objects: the others run programs that
@@ -535,20 +549,21 @@ def checkout(directory: Path = paths.PROJECT) -> Source | str:
         top, commit = _git(directory, "rev-parse", "--show-toplevel", "HEAD").decode().splitlines()
         if Path(top).resolve() != directory.resolve():  # unpacked inside somebody else's repository
             return f"{directory} is not the top of a git checkout"
-        return Source(commit=commit, dirty=_differs(directory, commit))
+        return Source(commit=commit, dirty=_differs(directory, commit, entering))
     except subprocess.CalledProcessError as error:
         return error.stderr.decode(errors="replace").strip().partition("\n")[0] or f"git failed ({error.returncode})"
     except (OSError, ValueError) as error:
         return str(error)
 
 
-def _differs(directory: Path, commit: str) -> bool:
-    """Whether the files of a checkout are others than those of the commit."""
+def _differs(directory: Path, commit: str, entering: Sequence[str]) -> bool:
+    """Whether the files of a checkout are others than those of the commit; in these folders, also whether there are
+    more."""
     committed = _committed(directory, commit)
     if any(_blob(path, identity) != (mode, identity) for path, (mode, identity) in committed.items()):
         return True
-    entering = (directory / name for name in _ENTERING)
-    return any(path not in committed for each in entering if each.is_dir() for path in sources.files(each))
+    folders = (directory / name for name in entering)
+    return any(path not in committed for each in folders if each.is_dir() for path in sources.files(each))
 
 
 def _committed(directory: Path, commit: str) -> dict[Path, tuple[str, str]]:

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from flotilla.common import cache, namespace, paths, progress, sources, together
 from flotilla.fleet import privileges
@@ -114,7 +114,7 @@ def key(board: Board, lock: Lock, tools_lock: Lock) -> str:
         cache.digest_of(DATA, lists()),
         *(Path(__file__).parent / name for name in MADE_BY),
         Path(namespace.__file__),
-        cache.digest_of(paths.OVERLAY, overlay_files()),
+        cache.digest_of_named(overlay_files()),
     )
 
 
@@ -128,9 +128,9 @@ def far(log: str, packages: int) -> progress.Far:
     return progress.Far(sum(_SECONDS[name] for name in ended) + share, sum(_SECONDS.values()), part=part)
 
 
-def overlay_files() -> list[Path]:
-    """The overlay's files common to all robots; templates belong to the identity."""
-    return [path for path in sources.files(paths.OVERLAY) if path.suffix != ".j2"]
+def overlay_files() -> dict[PurePosixPath, Path]:
+    """The overlay's files common to all robots, by their path in it; templates belong to the identity."""
+    return {name: path for name, path in sources.layered(paths.OVERLAY).items() if name.suffix != ".j2"}
 
 
 def lists() -> list[Path]:
@@ -345,8 +345,8 @@ def _prune_modules(stage: Stage, architecture: str) -> str:
 
 
 def lay_overlay(target: Path) -> None:
-    for source in overlay_files():
-        place = target / source.relative_to(paths.OVERLAY)
+    for name, source in overlay_files().items():
+        place = target / name
         # Nothing is written through a link: an absolute one of the root's would lead to this computer's files.
         if (leads := place.parent.resolve()) != (there := target.resolve()) and there not in leads.parents:
             raise SystemExit(

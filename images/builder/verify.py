@@ -172,7 +172,9 @@ def _prepare(directory: Path, board: Board, robot: Robot, *, plant: bool) -> tup
         packages=sysconfig.get_path("purelib"),
     )
     copy_checkout(directory / "checkout")
-    if paths.APPS != paths.PROJECT / "apps" and paths.APPS.exists():
+    if paths.OWN_HOME:
+        _copy(paths.HOME, directory / "fleet")
+    elif paths.APPS != paths.PROJECT / "apps" and paths.APPS.exists():
         shutil.copytree(paths.APPS, directory / "checkout/apps", symlinks=True, copy_function=_copy_as_cloned)
     if plant:
         overlay = directory / "checkout" / paths.OVERLAY.relative_to(paths.PROJECT)
@@ -205,14 +207,19 @@ def _prepare(directory: Path, board: Board, robot: Robot, *, plant: bool) -> tup
 
 def copy_checkout(copy: Path) -> None:
     """The checkout without outputs, keys and history, and with the modes that a clone under the other umask has."""
+    _copy(paths.PROJECT, copy)
 
+
+def _copy(directory: Path, copy: Path) -> None:
     def skipped(parent: str, names: list[str]) -> set[str]:
         kept_out = {paths.BUILD, paths.KEYS}
+        if paths.OWN_HOME:
+            kept_out |= {paths.PROJECT / "build", paths.PROJECT / "ansible/keys"}
         if paths.APPS != paths.PROJECT / "apps":
             kept_out.add(paths.PROJECT / "apps")
         return {name for name in names if name in _SKIPPED or Path(parent, name).resolve() in kept_out}
 
-    shutil.copytree(paths.PROJECT, copy, symlinks=True, ignore=skipped, copy_function=_copy_as_cloned)
+    shutil.copytree(directory, copy, symlinks=True, ignore=skipped, copy_function=_copy_as_cloned)
     for parent, _, _ in os.walk(copy):
         Path(parent).chmod(0o777 & ~_UMASK)
 
@@ -336,6 +343,7 @@ def main(description_file: str) -> int:
         "TZ": _ZONE,
         "BUILD": str(elsewhere / "build"),
         "KEYS": str(elsewhere / "keys"),
+        **({"FLEET": str(elsewhere / "fleet")} if (elsewhere / "fleet").exists() else {}),
         "FAKETIME": f"+{_DAYS}d",
         "FAKETIME_LIBRARIES": str(elsewhere / "faketime"),
         "FAKETIME_DONT_FAKE_MONOTONIC": "1",  # how long something takes is not the clock's business

@@ -249,9 +249,12 @@ def _say(ports: Mapping[str, int], how: str) -> None:
         os.path.relpath(place, paths.PROJECT / "ansible")
         for place in (GUESTS, INVENTORY if INVENTORY.exists() else paths.INVENTORY)
     )
+    command = f"cd ansible && ansible-playbook -i {described} -i {guests} -l guests fleet.yml"
+    if paths.OWN_HOME:
+        command = f"make provision ON=guests FLEET={paths.HOME}"
     sys.stderr.write(
         f"virtual fleet {how}: {listed}\n"
-        f"provision it: cd ansible && ansible-playbook -i {described} -i {guests} -l guests fleet.yml\n"
+        f"provision it: {command}\n"
         "shell: make ssh ROBOT=1    state: make fleet-status    end: make fleet-down\n"
     )
 

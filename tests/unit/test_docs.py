@@ -60,7 +60,7 @@ def unknown_targets(text: str) -> set[str]:
     """What stands in code as `make TARGET`, and is not in `make help`."""
     argv = ["make", "-C", str(paths.PROJECT), "help"]
     shown = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
-    return set(re.findall(r"(?:`|^)(?:sudo )?make ([a-z-]+)", text, re.MULTILINE)) - set(
+    return set(re.findall(r"(?:`|^)(?:sudo )?make (?:-C \S+ )?([a-z-]+)", text, re.MULTILINE)) - set(
         re.findall(r"^  ([a-z-]+) ", shown, re.MULTILINE)
     )
 

@@ -8,7 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -601,7 +601,7 @@ def places(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str |
 def test_no_odd_value_confuses_the_checks(odd: object) -> None:
     """Whatever stands in whatever place, the answer is a fleet or problems with remedies, never another exception."""
     sources = inventory.Sources(paths.INVENTORY)
-    listed = inventory._merged(paths.INVENTORY)
+    listed = inventory._merged([paths.INVENTORY])
     problems: list[Problem] = []
     for host in ("robot1", "robot2", "station"):
         variables = listed["_meta"]["hostvars"][host]
@@ -624,8 +624,8 @@ def test_second_load_asks_no_ansible(tmp_path: Path, monkeypatch: pytest.MonkeyP
     first = inventory.load_fleet(directory)
     asked: list[Path] = []
 
-    def ansible(path: Path) -> str:
-        asked.append(path)
+    def ansible(places: Sequence[Path]) -> str:
+        asked.extend(places)
         return "{}"
 
     monkeypatch.setattr(inventory, "_ansible_inventory", ansible)
@@ -641,7 +641,7 @@ def test_users_ansible_settings_do_not_count(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setenv("ANSIBLE_INVENTORY_ENABLED", "ini")
     (tmp_path / "ansible.cfg").write_text("[defaults]\nhash_behaviour = nonsense\n")
     monkeypatch.chdir(tmp_path)
-    assert json.loads(inventory._ansible_inventory(paths.INVENTORY))["robots"]
+    assert json.loads(inventory._ansible_inventory([paths.INVENTORY]))["robots"]
 
 
 @pytest.mark.parametrize("name", [ROBOTS, ALL, PC104])

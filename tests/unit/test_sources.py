@@ -69,10 +69,10 @@ def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
 
         def lay(to: Path) -> set[str]:
             rootfs.lay_overlay(to)
-            return below(to) | names(identity.templates(), copy)
+            return below(to) | names(list(identity.templates().values()), copy)
 
         def counted() -> list[str]:  # the manifest counts what templates render to
-            return [cache.digest(key, cache.digest_of(copy, identity.templates())) for key in of_board()]
+            return [cache.digest(key, cache.digest_of_named(identity.templates())) for key in of_board()]
 
         return Place(copy, lay, counted, UNTRACKED)
     if request.param == "lists":

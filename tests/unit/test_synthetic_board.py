@@ -246,7 +246,7 @@ def _hashes(directory: Path) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def merged() -> dict[str, Any]:
     """What Ansible says of the project's own hosts: the board's file is read without it."""
-    said: dict[str, Any] = json.loads(inventory._ansible_inventory(paths.INVENTORY))
+    said: dict[str, Any] = json.loads(inventory._ansible_inventory([paths.INVENTORY]))
     return said
 
 
