@@ -78,7 +78,6 @@ static void print_text(const char *name, const char *value)
 
 static int show(struct boot_card *card, struct boot_state *state, int running, int slot)
 {
-    (void)card;
     (void)slot;
     char name[] = {running >= 0 ? letter(running) : '\0', '\0'};
     char trial[] = {state->trial >= 0 ? letter(state->trial) : '\0', '\0'};
@@ -99,7 +98,7 @@ static int show(struct boot_card *card, struct boot_state *state, int running, i
         print_text("blob", each->blob);
         fputs(", ", stdout);
         print_text("kernel", each->kernel);
-        putchar('}');
+        printf(", \"start\": %" PRId64 ", \"size\": %" PRId64 "}", card->start[1 + i], card->size[1 + i]);
     }
     puts("}}");
     return fflush(stdout) == 0 ? 0 : refuse("standard output cannot be written");

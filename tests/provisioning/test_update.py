@@ -196,3 +196,16 @@ def test_a_release_that_nobody_reaches_goes_back(guests: Guests, make: Make) -> 
     back = guests.play("-e", "go=back", *STOP, *ONE, playbook="update")
     assert back.status != 0
     assert "there is nothing to go back to" in back.said, back.said
+
+
+@pytest.mark.nightly  # a guest more
+def test_a_robot_with_uefi_takes_a_release(fleet: Fleet, tmp_path: Path, session_artefacts: Path) -> None:
+    """Its card has a GPT. Seen to fail: `begin` ended with EINVAL on each such robot."""
+    robot = next(each for each in fleet.robots.values() if fleet.boards[each.board].firmware == "uefi")
+    made = build.board_build(fleet.boards[robot.board], fleet.releases)
+    content = successor(made, fleet.releases, tmp_path / "content")
+    offered = content.release(2, tmp_path / "release").bundle(fleet.releases)
+    with running(fleet, [robot], session_artefacts / "update-uefi") as guests:
+        done = update(guests, offered, *STOP, "-l", robot.name)
+        assert done.status == 0, done.said
+        assert runs(guests, robot.name) == ("B", "2")

@@ -113,8 +113,10 @@ def test_a_new_card_needs_nothing(new: Card) -> None:
     assert shown == {
         "running": "A", "sequence": 1, "order": ["A", "B"], "trial": None,
         "slots": {
-            "A": {"ok": True, "tries": 0, "release": "1", "floor": "1", "blob": f"{1:064x}", "kernel": "6.1.0-rt"},
-            "B": {"ok": False, "tries": 0, "release": "2", "floor": "1", "blob": f"{2:064x}", "kernel": "6.1.0-rt"},
+            "A": {"ok": True, "tries": 0, "release": "1", "floor": "1", "blob": f"{1:064x}", "kernel": "6.1.0-rt",
+                  "start": card.SLOTS[0].start, "size": card.SLOTS[0].size},
+            "B": {"ok": False, "tries": 0, "release": "2", "floor": "1", "blob": f"{2:064x}", "kernel": "6.1.0-rt",
+                  "start": card.SLOTS[1].start, "size": card.SLOTS[1].size},
         },
     }  # fmt: skip
     assert new.read(card.STATE.start, card.STATE.size) == before

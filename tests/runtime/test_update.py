@@ -22,7 +22,7 @@ from flotilla.common.errors import UserError
 from flotilla.robot import release
 from flotilla.updates import delta
 from images.builder import card, environment_block
-from tests.runtime.test_slot import partition_table
+from tests.runtime.test_slot import gpt, partition_table
 
 PROGRAM = paths.OVERLAY / "usr/lib/flotilla/update.py"
 CHUNK = 4096
@@ -170,7 +170,12 @@ def refused(robot: Robot, text: str, signatures: list[str]) -> str:
     return str(why.value)
 
 
-def test_a_release_is_taken_and_tried(robot: Robot) -> None:
+@pytest.mark.parametrize("table", ["", "GPT"])
+def test_a_release_is_taken_and_tried(robot: Robot, table: str) -> None:
+    """Seen to fail with a GPT, which is on the cards of computers with UEFI: `begin` ended with EINVAL."""
+    if table:
+        with robot.card.open("r+b") as file:
+            file.write(gpt())
     text = manifest_of(robot.blob, header_of(robot.blob, RELEASE="6"))
     told = robot.begin(text, robot.sign(text, "alice", "carol"))
     assert (told["slot"], told["running"], told["staged"], len(told["missing"])) == ("B", False, False, 41)

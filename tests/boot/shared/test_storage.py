@@ -50,3 +50,10 @@ def test_journal_is_kept_and_bounded(robot: RobotGuest) -> None:
     found = re.search(r"System Journal \(/var/log/journal/\w+\) is \S+, max (\S+),", lines)
     assert found, f"no journal on the card:\n{lines}"
     assert found[1] in ("16.0M", "16M"), f"the journal may take {found[1]}"
+
+
+def test_the_updater_finds_both_slots(robot: RobotGuest) -> None:
+    """Whatever partition table the card has. Seen to fail with a GPT: it read an MBR, so no robot took a release."""
+    program = "import sys; sys.path.insert(0, '/usr/lib/flotilla'); import update"
+    program += "; print(*(update.Slot(name).header().get('BOARD', 'empty') for name in 'AB'))"
+    assert sh(robot, f'python3 -ISc "{program}"').split() == [robot.robot.board, "empty"]
