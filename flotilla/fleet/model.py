@@ -152,7 +152,9 @@ SignalName = Annotated[
         "not in, out, flag or length",
     ),
 ]
-Word = Annotated[str, matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
+Word = Annotated[str, matching(r"\S+", "contains blanks or nothing", "one word, without blanks")]
+Item = Annotated[str, matching(r"\S+", "contains blanks or nothing", "one word; write further ones as further items")]
+"""A word of a list."""
 Architecture = Literal["i386", "amd64"]
 Release = Literal["bookworm", "trixie"]
 """Debian's names of the processor architectures that boards may have."""
@@ -244,7 +246,7 @@ class Qemu(_Model):
     """Bus that the card is attached to."""
     network: Word
     """QEMU device model of the wired port."""
-    devices: list[Word]
+    devices: list[Item]
     """Arguments of further `-device` options. Serial devices take chardevs: `port0` is the board's first port by tty,
     `port1` the second, and so on. The lab provides a chardev for each port; the console's needs no device."""
 
@@ -311,7 +313,7 @@ class Board(_Model):
     The first processor, 0, is for all the rest."""
     kernel: Literal["debian", "lean"]
     """`debian`: Debian's real-time kernel. `lean`: the one that `make kernel` builds from `kernel/NAME.yml`."""
-    kernel_arguments: list[Word]
+    kernel_arguments: list[Item]
     """Kernel command line, in addition to the arguments of every card."""
     console: Console
     """Serial port of GRUB, kernel messages and login."""
@@ -523,7 +525,7 @@ class Signal(_Model):
     """Type of an element."""
     width: Annotated[Integer, between(1, MESSAGE_BYTES, unit="elements")] = 1
     """Number of elements."""
-    unit: Annotated[list[Word], BeforeValidator(lambda unit: [unit] if isinstance(unit, str) else unit)] = []
+    unit: Annotated[list[Item], BeforeValidator(lambda unit: [unit] if isinstance(unit, str) else unit)] = []
     """Unit of all elements, or a list with one for each; `"1"` for a plain number. Required for `single` and `double`.
     The name of an integer says its unit, such as `sensed_ns`."""
 

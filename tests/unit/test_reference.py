@@ -18,3 +18,12 @@ def test_page_is_the_sources(name: str) -> None:
 def test_each_key_has_a_meaning(section: keys.Section) -> None:
     """Seen to fail with the docstring of `Can.bitrate` removed."""
     assert [key for key, field, _ in keys.fields(section) if not field.description] == []
+
+
+@pytest.mark.parametrize("section", keys.SECTIONS, ids=lambda section: section.title)
+def test_only_a_list_has_items(section: keys.Section) -> None:
+    """Seen to fail for `board.qemu.machine` and five more strings, whose remedy was to write further items."""
+    found = [
+        key for key, _, value in keys.fields(section) if "items" in value.text and not value.text.startswith("list")
+    ]
+    assert found == []
