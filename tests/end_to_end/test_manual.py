@@ -113,6 +113,11 @@ ELSEWHERE = {
     'make scenarios FLIGHTS="air air-10"': "test_scenarios.py flies them",
     'make scenarios ON=lockstep FLIGHTS="air air-10"': "test_scenarios_lockstep.py flies them, nightly",
     "make lock": "asks the mirror for other packages; unit/test_lock.py",
+    "make image ROBOT=5": "needs an added robot; test_one_more_robot builds its image",
+    **dict.fromkeys(
+        ("make lock ONLY=NAME", "make image ROBOT=6", "make boot ROBOT=6"),
+        "needs an added board; unit/test_synthetic_board.py adds one",
+    ),
     "make param ROBOT=1 TASK=heading": "needs the robot; test_control_loop.py asks a guest",
     "make param ROBOT=1 TASK=heading PARAM=attitude.kp VALUE=2.5": "needs the robot; test_control_loop.py asks a guest",
     **dict.fromkeys(

@@ -198,3 +198,27 @@ def test_the_tutorial_names_the_download_and_the_disk_of_its_steps(
     (disk,) = map(int, re.findall(r"(\d+) GB of free disk", page))
     installed = 1.0e9  # Python packages and QEMU, as the page says
     assert disk * 1e9 >= space.needed(trees, [root], [root]) + kernel._SPACE + installed
+
+
+# --- additions ---
+
+
+def test_an_addition_ends_in_the_image_of_what_was_added(fleet: Fleet) -> None:
+    """Seen to fail: `Add a robot` and `Add a board` ended in `make image ROBOT=3`, a robot that the fleet has."""
+    page = (paths.PROJECT / "docs" / "how-to" / "operations.md").read_text()
+    for title in ("Add a robot", "Add a board"):
+        section = page.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+        numbers = [int(number) for number in re.findall(r"^make image ROBOT=(\d+)$", section, re.MULTILINE)]
+        assert len(numbers) == 1, title
+        assert numbers[0] not in fleet.robots, f"{title}: the inventory has robot {numbers[0]} already"
+
+
+def test_a_board_with_the_watchdog_of_qemu_says_so(fleet: Fleet) -> None:
+    """Seen to fail: board_x86_64.yml named its ib700 a watchdog of any 64-bit PC."""
+    simulated = [
+        board for board in fleet.boards.values() if board.architecture == "amd64" and "ib700wdt" in board.modules
+    ]
+    assert simulated
+    for board in simulated:
+        text = (paths.INVENTORY / "group_vars" / f"board_{board.name}.yml").read_text()
+        assert re.search(r"- ib700wdt #.*QEMU.*replace", text), board.name

@@ -426,7 +426,7 @@ CASES = {
     "qemu memory": Case(X86_64, "memory_mib: 512", "memory_mib: 32", "board.qemu.memory_mib", "64 to 65536"),
     "qemu key": Case(X86_64, "    disk: ahci", "    disk: ahci\n    disks: 2", "board.qemu.disks", "mean disk?"),
     "value twice": Case(
-        X86_64, "  kernel: debian", "  kernel: debian\n  kernel: lean", "board.kernel", "stands twice, first in line 12"
+        X86_64, "  kernel: debian", "  kernel: debian\n  kernel: lean", "board.kernel", "stands twice, first in line …"
     ),
     "shared value in the wrong file": Case(
         X86_64, "board:\n", "network: {}\nboard:\n", "network", "a part of those who share it…group_vars/all.yml"
