@@ -113,6 +113,10 @@ ELSEWHERE = {
     'make scenarios FLIGHTS="air air-10"': "test_scenarios.py flies them",
     'make scenarios ON=lockstep FLIGHTS="air air-10"': "test_scenarios_lockstep.py flies them, nightly",
     "make lock": "asks the mirror for other packages; unit/test_lock.py",
+    **dict.fromkeys(
+        ("sudo cp proxy.crt /usr/local/share/ca-certificates/", "sudo update-ca-certificates"),
+        "changes this computer's certificates",
+    ),
     "make image ROBOT=5": "needs an added robot; test_one_more_robot builds its image",
     **dict.fromkeys(
         ("make lock ONLY=NAME", "make image ROBOT=6", "make boot ROBOT=6"),

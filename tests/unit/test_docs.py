@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from flotilla.common import paths
-from flotilla.fleet import identity
+from flotilla.fleet import identity, inventory, privileges
 from flotilla.fleet.model import Fleet
 from images.builder import build, kernel, space
 from images.builder.lock import read_lock
@@ -222,3 +222,31 @@ def test_a_board_with_the_watchdog_of_qemu_says_so(fleet: Fleet) -> None:
     for board in simulated:
         text = (paths.INVENTORY / "group_vars" / f"board_{board.name}.yml").read_text()
         assert re.search(r"- ib700wdt #.*QEMU.*replace", text), board.name
+
+
+# --- what the README promises ---
+
+README = paths.PROJECT / "README.md"
+
+
+def test_the_readme_names_each_board_and_shows_the_example_fleet(fleet: Fleet) -> None:
+    """Seen to fail: the page named no board; and with another address in its output of `make check-fleet`."""
+    page = README.read_text()
+    assert [board for board in fleet.boards if f"`{board}`" not in page] == []
+    assert f"\n```text\n{inventory.summary(fleet).rstrip()}\n```\n" in page
+
+
+def test_the_readme_has_the_tutorials_figures() -> None:
+    """Seen to fail with another size of the download."""
+    shown = [" ".join(page.read_text().split()) for page in (README, TUTORIAL)]
+    assert len({tuple(re.findall(r"downloads about \d+ MB", page)) for page in shown}) == 1
+
+
+USERS = {"root", "robot", *privileges.USERS}
+
+
+@pytest.mark.parametrize("document", documents())
+def test_users_that_a_document_names_exist(document: str) -> None:
+    """Seen to fail with a user `controls` in SECURITY.md."""
+    text = " ".join((paths.PROJECT / document).read_text().split())
+    assert set(re.findall(r"\busers? `([a-z-]+)`", text)) <= USERS
