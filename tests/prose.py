@@ -40,6 +40,7 @@ _PERCENT = re.compile(r"%(?P<comment>[^\n]*)")
 _YAML_TEXT = re.compile(
     r"^[ \t-]*(?:name|msg|fail_msg|success_msg):[ \t]*(?P<text>[^\n#]*[a-z]+ [^\n#]*)$", re.MULTILINE
 )
+_SPAN = r"(?<!`)(`+)(?!`)[^¶]+?(?<!`)\1(?!`)"
 _MAKE = re.compile(r"(?:^|(?<=[ \t]))#(?P<comment>[^#=@][^\n]*)", re.MULTILINE)
 _MARKUP = re.compile(r"<(script|style).*?</\1>|\{[%#{].*?[%#}]\}|<[^>]*>", re.DOTALL)
 _TEXT = re.compile(r"(?P<text>[A-Za-z][^\n]*)")
@@ -113,7 +114,7 @@ def prose(file: str, text: str) -> list[Piece]:
 
 def _plain(text: str) -> str:
     """Without marks of comments; a placeholder is in the place of code."""
-    return re.sub(r"`[^`]*`|\{[^{}]*\}", _code, re.sub(r"\n[ \t]*(?:#|\*|//|%)+", "\n", text))
+    return re.sub(rf"{_SPAN}|\{{[^{{}}]*\}}", _code, re.sub(r"\n[ \t]*(?:#|\*|//|%)+", "\n", text))
 
 
 def _blank(match: re.Match[str]) -> str:
@@ -126,8 +127,8 @@ def _code(match: re.Match[str]) -> str:
 
 def _markdown(text: str) -> Iterator[Piece]:
     """Paragraphs, list items, headings and cells of tables."""
-    text = re.sub(r"^(```|~~~).*?^\1[^\n]*$|<!--.*?-->", _blank, text, flags=re.MULTILINE | re.DOTALL)
-    text = re.sub(r"\]\([^)\s]*\)", "]", re.sub(r"`[^`]*`", _code, text))
+    text = re.sub(r"^(```|~~~|:::).*?^\1[^\n]*$|<!--.*?-->", _blank, text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"\]\([^)\s]*\)", "]", re.sub(_SPAN, _code, text))
     line, begin, piece = 0, 0, ""
     for line, each in enumerate([*text.splitlines(), ""], 1):
         words = each.strip(" >")
