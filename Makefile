@@ -1,10 +1,10 @@
-# Front door. `make help` lists the targets; V=1 shows the commands.
+# All commands. `make help` lists the targets; V=1 shows the commands that they run.
 # A fleet's home has outputs of its own; the Python environment is the checkout's.
 VENV := $(or $(value BUILD),build)/venv
 ifeq ($(value BUILD),)
 BUILD := $(if $(value FLEET),$(value FLEET)/build,build)
 endif
-# Paths that stand in commands as they are; flotilla/common/paths.py has the same characters.
+# Characters that paths in commands must not have; flotilla/common/paths.py has the same ones.
 not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$ : % = \#
 in_path = $(strip $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1)))
 unfit = a path with blanks or with a character that means something to a shell;
@@ -16,11 +16,11 @@ export BUILD
 export LC_ALL := C.UTF-8
 PYTHON := $(VENV)/bin/python
 FLOTILLA := $(PYTHON) -m flotilla
-# A part of a command: a line that moves on a terminal, a line at its end without one; what it says when it fails.
+# Progress of a part of a command: a live line on a terminal, else a line at its end; its output if it fails.
 step = $(PYTHON) -m flotilla.common.progress
 Q := $(if $(filter-out 0,$(V)),,@)
 export V FLEET MIRROR SECURITY_MIRROR SNAPSHOT KEYS APPS INVENTORY PART PYTHON3
-# Of these the fleet is fixed; nobody shall think that it was another.
+# These targets have a fixed fleet, so FLEET and INVENTORY are errors.
 $(foreach name,FLEET INVENTORY,$(if $(and $(value $(name)),$(filter wheeled wheeled-down scenarios check test test-all,\
     $(MAKECMDGOALS))),$(error $(name)=$(value $(name)): $(MAKECMDGOALS) has a fleet of its own; leave $(name) out)))
 # Python imports no packages of the user's, and pip puts none among them.
@@ -223,13 +223,13 @@ test-clock: | setup-tests
 	$(Q)MAKEFLAGS= $(MAKE) --no-print-directory runtime
 	$(Q)$(run_tests) -m '$(selected) and clock' >$(COSTS).clock 2>&1; status=$$?; cat $(COSTS).clock; exit $$status
 
-# What is no test belongs to the first part.
+# The first part of `make test-all` also runs the checks that are not tests.
 checked = $(if $(TIER:all=),,$(if $(value PART),$(filter 1/%,$(value PART)),yes))
 test-others: | setup-tests
 ifneq ($(checked),)
 	$(Q)MAKEFLAGS= $(cost) lint $(MAKE) --no-print-directory lint
 	$(Q)MAKEFLAGS= $(cost) check-runtime $(MAKE) --no-print-directory check-runtime
-	@# With a seed, so that whoever changed nothing finds nothing.
+	@# With a seed, so that a run without changes finds nothing new.
 	$(if $(TIER),$(Q)MAKEFLAGS= $(cost) fuzz $(MAKE) --no-print-directory fuzz SECONDS=3 SEED=1)
 endif
 	$(if $(filter unit runtime,$(TIER)),,$(Q)$(cost) images $(FLOTILLA) image --all)
@@ -237,7 +237,7 @@ endif
 
 # In a directory of outputs of its own, whose runtime counts; cache, pool and environment are the usual ones.
 covered = $(abspath $(BUILD))/coverage
-# GCC 12 crashes where it judges formats in code that counts branches; every other build judges them.
+# GCC 12 crashes when it checks formats in code that counts branches; every other build checks them.
 uncounted_warnings = -Dc_args='-Wno-format-overflow -Wno-format-truncation'
 coverage_report = $(abspath $(BUILD))/reports/coverage
 coverage: export COVERAGE_FILE = $(covered)/.coverage
@@ -269,7 +269,7 @@ meson = PATH="$(abspath $(VENV))/bin:$$PATH" meson
 # A directory of meson's names the place of its sources: in a checkout that was moved it is made anew.
 configured = { test -f $1/build.ninja && test "$$(cat $1/.place 2>&1)" = "$$(pwd -P)"; } || \
     { rm -rf $1; $2 $(meson) setup $1 runtime $3 >/dev/null; pwd -P >$1/.place; }
-# What a compiler says matters when it fails.
+# The output of a compiler matters only if it fails.
 compile = $(meson) compile -C $1 $2 >$1/compile.log || { cat $1/compile.log >&2; exit 1; }
 runtime: | setup-runtime ## compile the runtime for this computer in build/runtime
 	@# One after the other: processes that run tests ask for it at once.
@@ -304,7 +304,7 @@ station: | setup-station ## serve a page that shows, drives and tunes the fleet 
 	$(Q)$(FLOTILLA) station $(call option,--inventory,INVENTORY) $(call option,--port,PORT) $(call option,--page-address,ADDRESS) $(call option,--record,OUT) \
 	    $(call option,--replay,REPLAY) $(call option,--seconds,SECONDS)
 
-# One program receives, since a port can be received at only once: what it does with it is told by variables too.
+# Only one program can receive at a port, so variables give further tasks to the same program.
 station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS) $(call option,--inventory,INVENTORY)
 record: | setup-station ## record telemetry to an MCAP file | [OUT=file] [SECONDS=60] [PORT=8765] [ADDRESS=127.0.0.1]
 	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
@@ -340,7 +340,7 @@ scope: | setup ## show or record the signals of a running task | ROBOT=1 TASK=he
 
 ##@ Real time
 .PHONY: latency latency-accept boot-time hwcheck accept scenarios scenarios-accept
-# What is measured: the board's system with each kernel, or one of them, or less of it, or a robot.
+# The system to measure: the board's with each kernel, or with one kernel, or a part of it, or a robot.
 measured = $(call option,--board,BOARD) $(call option,--kernel,KERNEL) $(call option,--plan,PLAN)
 latency: | setup-lab setup-runtime ## measure latency in virtual time; compare with a baseline | [PLAN=quick|standard|disk] [BOARD=x86_64] [KERNEL=lean|debian|no-rt] [TARGET=ssh:robot3]
 	$(Q)$(FLOTILLA) latency $(measured) $(call option,--target,TARGET)
@@ -424,7 +424,7 @@ help: ## show this list, or the variables of one target | [TARGET=flash]
 ##= V=1               show the commands
 
 comma := ,
-# What somebody gave reaches a program as it stands, as one word or as several: no shell reads it as a command.
+# Values of variables reach a program verbatim, as one word or as several: no shell interprets them.
 quoted = '$(subst ','\'',$1)'
 given = $(call quoted,$(value $1))
 each_given = $(foreach each,$(value $1),$(call quoted,$(each)))

@@ -1,6 +1,6 @@
 """Looks for the words that docs/style.md forbids: `python -m tests.prose`.
 
-    show [FILE…]   prints each place: file, line, words, remedy
+    show [PATH…]   prints each place: file, line, words, remedy
     lower          writes lower numbers into prose_left.txt, and removes files that have none left; makes the whole
                    list if there is none
 
@@ -252,7 +252,8 @@ def main(argv: list[str]) -> None:
     if argv == ["lower"]:
         lower()
     elif argv[:1] == ["show"]:
-        for there in found(argv[1:] or files()).values():
+        wanted = [name for name in files() if not argv[1:] or {name, *map(str, Path(name).parents)} & set(argv[1:])]
+        for there in found(wanted).values():
             print(*there, sep="\n")
     else:
         sys.exit(__doc__)
