@@ -301,6 +301,29 @@ def test_the_end_stops_the_motor_before_it_loses_its_power(
     assert after < 6 < before, drive.way
 
 
+def test_no_drive_misses_heartbeats_while_another_comes_to_rest(run: Any, hub: UdpHub) -> None:
+    """Each takes 0.6 s to stop, and 0.3 s without a heartbeat are an error of the drive.
+
+    Seen to fail: drive 3 had error 8130 (heartbeat), while the end of drive 4 was awaited.
+    """
+    slow = drive_task("velocity", 5, "stop_deceleration: 8").replace("heartbeat: 1,", "heartbeat: 0.3,")
+    other = slow.partition("blocks:\n")[2].replace("drive:", "other:").replace("node: 3", "node: 4, master: 126")
+    drives = Watched(NODE), Watched(4)
+    server = Epos2Server(hub, *drives)
+    with server.running():
+        with run(slow + other, "drive.velocity,other.velocity") as task:
+            task.until(lambda row: min(row["drive.velocity"], row["other.velocity"]) > 4.5)
+            assert task.end() == 0
+        with server.paused():
+            assert [drive.errors for drive in drives] == [[], []]
+        for drive in drives:
+            await_axis(server, drive, Axis.SWITCH_ON_DISABLED)
+    for drive in drives:
+        (stopping, before), (last, after) = drive.way[-2:]
+        assert (stopping, last) == (Axis.QUICK_STOP_ACTIVE, Axis.SWITCH_ON_DISABLED), drive.way
+        assert after < 6 < before, drive.way
+
+
 def test_the_end_stops_a_drive_with_other_settings(run: Any, hub: UdpHub) -> None:
     """What the drive has stored is another robot's: RPDO1 hears node 1's identifier. NMT alone would not stop it."""
     drive = Epos2(NODE)

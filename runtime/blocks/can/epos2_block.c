@@ -47,8 +47,10 @@ struct state {
     struct fl_ring troubles;    /* from the step to the thread, for the journal */
     struct epos2_trouble known; /* the step has put into it */
     struct epos2_trouble now, logged;
-    int64_t since_ns; /* of `now` */
-    int64_t safe_ns;  /* the quick stop at the end was sent; 0: it was not */
+    int64_t since_ns;        /* of `now` */
+    _Atomic int64_t safe_ns; /* the quick stop at the end was sent; 0: it was not. From then on the drive is the
+                                thread's, and no step's */
+    bool ended;              /* the last frames were sent */
 };
 
 #define RPM (60 / (2 * 3.14159265358979323846)) /* of one rad/s */
@@ -251,29 +253,6 @@ static void report(struct state *state)
         state->known = *trouble;
 }
 
-static int start(struct fl_block *block)
-{
-    enum { TROUBLES = 16 };
-    const struct epos2_block *set = block->parameters;
-    struct state *state = block->state;
-    struct epos2_settings settings = settings_of(set);
-    uint32_t identifiers[EPOS2_IDENTIFIERS];
-    struct can_filter filters[EPOS2_IDENTIFIERS];
-    epos2_begin(&state->drive, &settings);
-    epos2_identifiers(&settings, identifiers);
-    for (size_t i = 0; i < EPOS2_IDENTIFIERS; i++)
-        filters[i] = (struct can_filter){identifiers[i], CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
-    void *troubles = fl_allocate(block, fl_ring_bytes(sizeof(struct epos2_trouble), TROUBLES));
-    if (!troubles)
-        return FL_FAILED;
-    fl_ring_initialize(&state->troubles, troubles, sizeof(struct epos2_trouble), TROUBLES);
-    fl_sensor_begin(&state->sensor);
-    if (set->sync == 0)
-        can_sync_claim(&state->sync, set->interface); /* the first block that starts */
-    state->can.watch = watch;
-    return can_start(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS);
-}
-
 /* Whether the bus takes them all. A frame that the queue refuses is not kept: the next step has newer ones. */
 static bool send_all(struct state *state, const struct can_frame *frames, size_t count)
 {
@@ -349,12 +328,14 @@ static void safe(struct fl_block *block)
     struct can_frame out[EPOS2_FRAMES];
     if (!send_all(state, out, epos2_quick_stop(&state->drive, out)))
         fl_not_safe(block, "the drive could not be reached by the CAN bus");
-    if (!state->safe_ns)
-        state->safe_ns = fl_now_ns();
+    if (!atomic_load(&state->safe_ns))
+        atomic_store(&state->safe_ns, fl_now_ns());
+    can_end(&state->can);
 }
 
-/* After the quick stop: wait until the motor stands and its power is off, or may be taken off. A drive that does not
- * work, or works for an earlier program, is commanded again and again, as long as it says anything. */
+/* After the quick stop, for all drives of the task at the same time: wait until the motor stands and its power is off,
+ * or may be taken off. A drive that does not work, or works for an earlier program, is commanded again and again, as
+ * long as it says anything. */
 static void await_rest(struct fl_block *block)
 {
     enum { AGAIN_MS = 100, SILENT_MS = 300, LONGEST_MS = 800 /* a watchdog waits for a second */ };
@@ -363,17 +344,19 @@ static void await_rest(struct fl_block *block)
     struct state *state = block->state;
     const int64_t heartbeat_ns = llround(set->heartbeat * 1e9) / (2 * EPOS2_HEARTBEATS), most_ns = 10 * ms;
     const struct timespec nap = {.tv_nsec = (long)(heartbeat_ns < most_ns ? heartbeat_ns : most_ns)};
-    /* The block of this task that sends SYNC may have ended before this one. */
-    const struct epos2_command off = {.sync = atomic_load(&state->sync.ours), .target = (double)NAN};
     struct can_frame out[EPOS2_FRAMES];
-    int64_t now_ns = fl_now_ns(), heard_ns = now_ns, sent_ns = 0;
-    while (can_connected(&state->can) && now_ns - state->safe_ns < LONGEST_MS * ms) {
+    const int64_t safe_ns = atomic_load(&state->safe_ns);
+    int64_t now_ns = fl_now_ns(), heard_ns = now_ns, sent_ns = safe_ns;
+    while (can_connected(&state->can) && now_ns - safe_ns < LONGEST_MS * ms) {
         bool works = state->drive.phase == EPOS2_RUNNING;
         if (take_all(state))
             heard_ns = now_ns;
         if (works ? !epos2_powered(&state->drive) : now_ns - heard_ns > SILENT_MS * ms)
             return;
+        if (set->sync == 0)
+            can_sync_claim(&state->sync, set->interface); /* who has sent it may have ended */
         if (works || now_ns - sent_ns > AGAIN_MS * ms) {
+            const struct epos2_command off = {.sync = atomic_load(&state->sync.mine), .target = (double)NAN};
             sent_ns = now_ns;
             send_all(state, out,
                      works ? epos2_advance(&state->drive, now_ns, &off, out) : epos2_quick_stop(&state->drive, out));
@@ -383,15 +366,49 @@ static void await_rest(struct fl_block *block)
     }
 }
 
-static void terminate(struct fl_block *block)
+/* By the thread, because `terminate` of other blocks may take longer than a drive waits for a heartbeat. */
+static void end(struct fl_block *block)
 {
     struct state *state = block->state;
     struct can_frame out[EPOS2_FRAMES];
-    if (state->safe_ns)
+    if (atomic_load(&state->safe_ns))
         await_rest(block);
     send_all(state, out, epos2_shutdown(&state->drive, out));
+    can_sync_release(&state->sync); /* for a drive that still turns */
+    state->ended = true;
+}
+
+static void terminate(struct fl_block *block)
+{
+    struct state *state = block->state;
+    can_join(&state->can);
+    if (!state->ended)
+        end(block);
     can_stop(&state->can);
-    can_sync_release(&state->sync);
+}
+
+static int start(struct fl_block *block)
+{
+    enum { TROUBLES = 16 };
+    const struct epos2_block *set = block->parameters;
+    struct state *state = block->state;
+    struct epos2_settings settings = settings_of(set);
+    uint32_t identifiers[EPOS2_IDENTIFIERS];
+    struct can_filter filters[EPOS2_IDENTIFIERS];
+    epos2_begin(&state->drive, &settings);
+    epos2_identifiers(&settings, identifiers);
+    for (size_t i = 0; i < EPOS2_IDENTIFIERS; i++)
+        filters[i] = (struct can_filter){identifiers[i], CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
+    void *troubles = fl_allocate(block, fl_ring_bytes(sizeof(struct epos2_trouble), TROUBLES));
+    if (!troubles)
+        return FL_FAILED;
+    fl_ring_initialize(&state->troubles, troubles, sizeof(struct epos2_trouble), TROUBLES);
+    fl_sensor_begin(&state->sensor);
+    if (set->sync == 0)
+        can_sync_claim(&state->sync, set->interface); /* the first block that starts */
+    state->can.watch = watch;
+    state->can.end = end;
+    return can_start(block, &state->can, set->interface, filters, EPOS2_IDENTIFIERS);
 }
 
 FL_BLOCK(epos2) = {

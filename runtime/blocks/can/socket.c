@@ -8,6 +8,7 @@
 #include <linux/can/raw.h>
 #include <net/if.h>
 #include <string.h>
+#include <sys/eventfd.h>
 #include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <time.h>
@@ -137,11 +138,14 @@ static void update(struct can_socket *can)
 static void run(struct fl_driver *driver, void *context)
 {
     struct can_socket *can = context;
-    while (fl_driver_wait(driver, -1, false, LOOK_MS) == 0) {
+    int woken;
+    while ((woken = fl_driver_wait(driver, can->end_fd ? can->end_fd : -1, false, LOOK_MS)) == 0) {
         update(can);
         if (can->watch)
             can->watch(can->block);
     }
+    if (woken == 1)
+        can->end(can->block);
 }
 
 int can_start(struct fl_block *block, struct can_socket *can, const char *interface, const struct can_filter *filters,
@@ -155,19 +159,37 @@ int can_start(struct fl_block *block, struct can_socket *can, const char *interf
         memcpy(can->filters, filters, count * sizeof *filters);
     can->filter_count = count;
     can->logged = UNKNOWN;
+    if (can->end && (can->end_fd = eventfd(0, EFD_CLOEXEC)) < 0) {
+        can->end_fd = 0;
+        return fl_fail(block, "eventfd: %s", strerror(errno));
+    }
     update(can); /* one that is there is used from the first step on */
     /* It is in no hurry, and at a priority of its task's it would hold up every task of less. */
     can->driver = fl_driver_start_ordinary(block, run, can);
     return can->driver ? FL_OK : FL_FAILED;
 }
 
-void can_stop(struct can_socket *can)
+void can_end(const struct can_socket *can)
+{
+    if (can->end_fd)
+        eventfd_write(can->end_fd, 1);
+}
+
+void can_join(struct can_socket *can)
 {
     fl_driver_stop(can->driver);
     can->driver = NULL;
+}
+
+void can_stop(struct can_socket *can)
+{
+    can_join(can);
     int fd = atomic_exchange(&can->fd, 0);
     if (fd)
         close(fd);
+    if (can->end_fd)
+        close(can->end_fd);
+    can->end_fd = 0;
 }
 
 /* --- the step --- */

