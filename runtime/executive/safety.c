@@ -266,6 +266,11 @@ void safety_terminates(const struct fl_block *block)
         return;
     atomic_store(&safety.terminating, block);
     timer_settime(safety.limit, 0, &(struct itimerspec){.it_value.tv_sec = TERMINATE_S}, NULL);
+    if (!atomic_load(&safety.stopping))
+        return;
+    /* Another thread has begun to make outputs safe meanwhile: its limit holds. */
+    atomic_store(&safety.terminating, NULL);
+    timer_settime(safety.limit, 0, &(struct itimerspec){.it_value.tv_sec = LIMIT_S}, NULL);
 }
 
 void safety_step_begin(void)
