@@ -11,40 +11,44 @@
 /* --- what Cyclone DDS logs --- */
 
 /* Without a network Cyclone logs each message that it cannot send. A line is written once for each place in its code,
- * until it has logged nothing for a while. */
-enum { PLACES = 16 };
+ * until that place has logged nothing for a while. */
+enum { PLACES = 64 };
 #define QUIET_NS (INT64_C(1000000000) * FL_REASONS_STEADY_S)
 
 struct place {
-    const char *file;
+    const char *file; /* NULL: none */
     uint32_t line;
+    int64_t last_ns; /* of what it has logged, written or not */
 };
 static struct {
     pthread_mutex_t lock;
-    struct place written[PLACES];
-    unsigned count;
-    int64_t last_ns;
+    struct place places[PLACES];
 } logged = {.lock = PTHREAD_MUTEX_INITIALIZER};
 
 enum { WHY_BYTES = 192 };
 /* Where the first error of the calling thread goes instead; NULL: nowhere else. */
 static _Thread_local char *why;
 
-static bool is_new(struct place place)
+/* Whether the place has logged nothing lately. A place that is not known takes the place of the one that has been quiet
+ * for longest. */
+static bool is_new(const char *file, uint32_t line)
 {
     const int64_t now_ns = fl_now_ns();
-    bool known = false;
     pthread_mutex_lock(&logged.lock);
-    if (now_ns - logged.last_ns > QUIET_NS)
-        logged.count = 0;
-    logged.last_ns = now_ns;
-    for (unsigned i = 0; i < logged.count; i++)
-        known |= logged.written[i].line == place.line && strcmp(logged.written[i].file, place.file) == 0;
-    known |= logged.count == PLACES;
-    if (!known)
-        logged.written[logged.count++] = place;
+    struct place *place = logged.places;
+    for (struct place *other = place; other < logged.places + PLACES; other++) {
+        if (other->file && other->line == line && strcmp(other->file, file) == 0) {
+            place = other;
+            break;
+        }
+        if (!other->file || (place->file && other->last_ns < place->last_ns))
+            place = other;
+    }
+    bool known = place->file && place->line == line && strcmp(place->file, file) == 0;
+    bool new = !known || now_ns - place->last_ns > QUIET_NS;
+    *place = (struct place){file, line, now_ns};
     pthread_mutex_unlock(&logged.lock);
-    return !known;
+    return new;
 }
 
 static void write_log(void *context, const dds_log_data_t *data)
@@ -57,7 +61,7 @@ static void write_log(void *context, const dds_log_data_t *data)
     if (why && data->priority & (DDS_LC_ERROR | DDS_LC_FATAL)) {
         if (!*why)
             snprintf(why, WHY_BYTES, "%.*s", length, text);
-    } else if (is_new((struct place){data->file, data->line})) {
+    } else if (is_new(data->file, data->line)) {
         fprintf(stderr, "DDS: %.*s\n", length, text);
     }
 }
