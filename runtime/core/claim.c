@@ -3,6 +3,7 @@
 
 #include <errno.h>
 #include <grp.h>
+#include <pthread.h>
 #include <stddef.h>
 #include <stdio.h>
 #include <string.h>
@@ -18,6 +19,16 @@ enum {
 };
 
 #define TASKS "control" /* the group of control tasks */
+
+static pthread_once_t once = PTHREAD_ONCE_INIT;
+static gid_t tasks = (gid_t)-1; /* the group's number */
+
+static void look_up(void)
+{
+    const struct group *group = getgrnam(TASKS);
+    if (group)
+        tasks = group->gr_gid;
+}
 
 static bool may_log_in(uid_t user)
 {
@@ -36,15 +47,14 @@ static bool counts(int connection, const struct ucred *peer)
     socklen_t size = sizeof groups;
     if (claim_user_counts(peer->uid))
         return true;
-    const struct group *tasks = getgrnam(TASKS);
-    if (!tasks)
+    if (tasks == (gid_t)-1)
         return false;
-    if (peer->gid == tasks->gr_gid)
+    if (peer->gid == tasks)
         return true;
     if (getsockopt(connection, SOL_SOCKET, SO_PEERGROUPS, groups, &size) < 0)
         return false;
     for (size_t i = 0; i < size / sizeof *groups; i++)
-        if (groups[i] == tasks->gr_gid)
+        if (groups[i] == tasks)
             return true;
     return false;
 }
@@ -97,6 +107,7 @@ enum claim_result claim_take(const char *kind, const char *key, bool deaf, struc
 {
     struct sockaddr_un address;
     int own = -1, number;
+    pthread_once(&once, look_up); /* when a block starts: later claims are those of threads */
     *claim = (struct claim){.fd = -1};
     for (number = 0; number < SOCKETS && own < 0; number++) {
         socklen_t length = address_of(kind, key, number, &address);
