@@ -23,6 +23,12 @@ static bool lock(mqd_t descriptor, off_t from, off_t count, short kind)
     return fcntl(descriptor, F_OFD_SETLK, &range) == 0;
 }
 
+/* By another process or block. */
+static bool is_held(int error)
+{
+    return error == EAGAIN || error == EACCES;
+}
+
 /* Whoever may open the queue may hold the lock: not for ever. */
 static bool lock_changes(mqd_t descriptor)
 {
@@ -30,10 +36,12 @@ static bool lock_changes(mqd_t descriptor)
     bool locked = false;
     for (int i = 0; i < TRIES && !locked; i++) {
         locked = lock(descriptor, LOCK_CHANGE, 1, F_WRLCK);
-        if (!locked && errno != EAGAIN && errno != EACCES)
+        if (!locked && !is_held(errno))
             break;
-        if (!locked)
+        if (!locked) {
             nanosleep(&(struct timespec){.tv_nsec = PAUSE_NS}, NULL);
+            errno = EAGAIN;
+        }
     }
     return locked;
 }
@@ -98,8 +106,11 @@ static enum opened settle(struct queue *queue, struct fl_block *block, enum queu
         return FAILED;
     }
     if (!lock(queue->descriptor, LOCK_ENDS + (off_t)end, 1, F_WRLCK)) {
-        fl_fail(block, "another block already %s queue %s", end == QUEUE_SENDER ? "sends to" : "receives from",
-                queue->name);
+        if (is_held(errno))
+            fl_fail(block, "another block already %s queue %s", end == QUEUE_SENDER ? "sends to" : "receives from",
+                    queue->name);
+        else
+            fl_fail(block, "queue %s cannot be locked: %s", queue->name, strerror(errno));
         return FAILED;
     }
     return OPENED;
@@ -141,8 +152,8 @@ static enum opened open_once(struct queue *queue, struct fl_block *block, enum q
     share(queue->descriptor);
     enum opened opened = FAILED;
     if (!lock_changes(queue->descriptor))
-        fl_fail(block, "queue %s cannot be locked: another process holds its lock: end the tasks that use it",
-                queue->name);
+        fl_fail(block, "queue %s cannot be locked: %s", queue->name,
+                is_held(errno) ? "another process holds its lock: end the tasks that use it" : strerror(errno));
     else if (is_removed(queue->descriptor))
         opened = AGAIN;
     else

@@ -20,7 +20,27 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-static char name[32]; /* this test's own queue */
+static char name[32];       /* this test's own queue */
+static int lock_error;      /* with which the kernel refuses a lock; 0: it does not */
+static off_t refused_range; /* that begins here */
+
+/* Of the C library. */
+int fcntl(int fd, int command, ...)
+{
+    va_list arguments;
+    va_start(arguments, command);
+    void *argument = va_arg(arguments, void *);
+    va_end(arguments);
+    if (lock_error && command == F_OFD_SETLK && ((const struct flock *)argument)->l_start == refused_range) {
+        errno = lock_error;
+        return -1;
+    }
+#ifdef SYS_fcntl64
+    return (int)syscall(SYS_fcntl64, fd, command, argument);
+#else
+    return (int)syscall(SYS_fcntl, fd, command, argument);
+#endif
+}
 
 static mqd_t open_queue(int flags, long messages, long bytes)
 {
@@ -412,6 +432,30 @@ static bool lower_limit(void)
     return setrlimit(RLIMIT_MSGQUEUE, &(struct rlimit){200, 200}) == 0;
 }
 
+/* Seen to fail: "another process holds its lock" and "another block already sends to", whatever the kernel said. */
+static void says_why_it_cannot_lock(void **state)
+{
+    (void)state;
+    enum { SENDER = 0, CHANGE = 2 };
+    static const struct {
+        int error;
+        off_t range;
+        const char *reason;
+    } cases[] = {
+        {ENOLCK, CHANGE, "cannot be locked: No locks available"},
+        {ENOLCK, SENDER, "cannot be locked: No locks available"},
+        {EAGAIN, SENDER, "another block already sends to queue"},
+    };
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
+        struct fl_block *send = testbed_block("queue-send", "name", name, NULL);
+        refused_range = cases[i].range;
+        lock_error = cases[i].error;
+        refuses_to_start(send, cases[i].reason);
+        lock_error = 0;
+        mq_unlink(name);
+    }
+}
+
 static void explains_limits(void **state)
 {
     (void)state;
@@ -436,6 +480,7 @@ int main(void)
         cmocka_unit_test(makes_anew_what_is_being_removed),
         cmocka_unit_test(is_of_the_group_that_tasks_share),
         cmocka_unit_test(refuses),
+        cmocka_unit_test(says_why_it_cannot_lock),
         cmocka_unit_test(explains_limits),
     };
     snprintf(name, sizeof name, "/flotilla-test-%d", (int)getpid());
