@@ -149,24 +149,33 @@ static bool fits(dc1394camera_t *camera, dc1394video_frame_t *frame, const struc
            frame->stride >= frame->size[0];
 }
 
-/* Take the frame that is ready; false when the camera is gone. */
+/* Take the newest of the frames that are ready; false when the camera is gone. */
 static bool take(dc1394camera_t *camera, struct grabber *grabber)
 {
     const struct iidc *set = grabber->parameters;
-    dc1394video_frame_t *frame = NULL;
-    if (dc1394_capture_dequeue(camera, DC1394_CAPTURE_POLICY_POLL, &frame) != DC1394_SUCCESS)
-        return false;
-    if (!frame)
-        return true;
-    if (fits(camera, frame, set)) {
-        uint8_t *to = grabber_pixels(grabber);
-        for (size_t row = 0; row < frame->size[1]; row++)
-            memcpy(to + row * frame->size[0], frame->image + row * frame->stride, frame->size[0]);
-        grabber_publish(grabber, taken_ns(frame));
-    } else {
-        GRABBER_TELL(grabber, "an image is damaged, or of another size: check the cable");
+    dc1394video_frame_t *newest = NULL;
+    for (int taken = 0; taken < BUFFERS; taken++) {
+        dc1394video_frame_t *frame = NULL;
+        if (dc1394_capture_dequeue(camera, DC1394_CAPTURE_POLICY_POLL, &frame) != DC1394_SUCCESS)
+            return false;
+        if (!frame)
+            break;
+        bool usable = fits(camera, frame, set);
+        if (!usable)
+            GRABBER_TELL(grabber, "an image is damaged, or of another size: check the cable");
+        dc1394video_frame_t *older = usable ? newest : frame;
+        if (older && dc1394_capture_enqueue(camera, older) != DC1394_SUCCESS)
+            return false;
+        grabber->published += usable && newest;
+        newest = usable ? frame : newest;
     }
-    return dc1394_capture_enqueue(camera, frame) == DC1394_SUCCESS;
+    if (!newest)
+        return true;
+    uint8_t *to = grabber_pixels(grabber);
+    for (size_t row = 0; row < newest->size[1]; row++)
+        memcpy(to + row * newest->size[0], newest->image + row * newest->stride, newest->size[0]);
+    grabber_publish(grabber, taken_ns(newest));
+    return dc1394_capture_enqueue(camera, newest) == DC1394_SUCCESS;
 }
 
 static void run(struct fl_driver *driver, void *context)

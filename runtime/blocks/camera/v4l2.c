@@ -242,21 +242,41 @@ static int64_t taken_ns(const struct v4l2_buffer *buffer)
     return stamp_ns < now_ns ? stamp_ns : now_ns;
 }
 
-/* Take the frame that is ready; false when the camera is gone. */
+/* To be filled again. */
+static bool give_back(const struct stream *stream, uint32_t index)
+{
+    struct v4l2_buffer buffer = buffer_of(index);
+    return request(stream->fd, VIDIOC_QBUF, &buffer);
+}
+
+/* Take the newest of the frames that are ready; false when the camera is gone. */
 static bool take(struct stream *stream, struct grabber *grabber)
 {
-    struct v4l2_buffer buffer = buffer_of(0);
-    if (!request(stream->fd, VIDIOC_DQBUF, &buffer))
-        return errno == EAGAIN || errno == EIO; /* EIO: the frame was lost */
-    if (buffer.index >= stream->count)
-        return false;
-    if (complete(stream, &buffer)) {
-        convert(stream, stream->buffers[buffer.index].start, grabber_pixels(grabber));
-        grabber_publish(grabber, taken_ns(&buffer));
-    } else {
-        GRABBER_TELL(grabber, "an image is incomplete: check the cable");
+    struct v4l2_buffer newest = buffer_of(0);
+    bool any = false;
+    for (size_t taken = 0; taken < stream->count; taken++) {
+        struct v4l2_buffer buffer = buffer_of(0);
+        if (!request(stream->fd, VIDIOC_DQBUF, &buffer)) {
+            if (errno == EAGAIN || errno == EIO) /* none is left; EIO: the frame was lost */
+                break;
+            return false;
+        }
+        if (buffer.index >= stream->count)
+            return false;
+        bool usable = complete(stream, &buffer);
+        if (!usable)
+            GRABBER_TELL(grabber, "an image is incomplete: check the cable");
+        if ((!usable || any) && !give_back(stream, usable ? newest.index : buffer.index))
+            return false;
+        grabber->published += usable && any;
+        newest = usable ? buffer : newest;
+        any |= usable;
     }
-    return request(stream->fd, VIDIOC_QBUF, &buffer);
+    if (!any)
+        return true;
+    convert(stream, stream->buffers[newest.index].start, grabber_pixels(grabber));
+    grabber_publish(grabber, taken_ns(&newest));
+    return give_back(stream, newest.index);
 }
 
 static void run(struct fl_driver *driver, void *context)

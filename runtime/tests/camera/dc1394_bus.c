@@ -3,6 +3,7 @@
 
 #include <assert.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
@@ -16,20 +17,28 @@ static void wake(void)
         abort();
 }
 
-void bus_expose(int64_t age_ms)
+void bus_fill(int64_t age_ms)
 {
     struct timespec real;
+    unsigned next = bus.filled % BUS_BUFFERS;
     clock_gettime(CLOCK_REALTIME, &real);
-    LOCKED(if (bus.transmits && !bus.waiting) {
-        bus.frame = (dc1394video_frame_t){
-            .image = bus.image,
-            .size = {WIDTH, HEIGHT},
-            .stride = STRIDE,
-            .color_coding = DC1394_COLOR_CODING_MONO8,
-            .timestamp = (uint64_t)(real.tv_sec * INT64_C(1000000) + real.tv_nsec / 1000 - age_ms * 1000)};
-        bus.waiting = true;
-        wake();
-    });
+    if (!bus.transmits || bus.buffers[next].full)
+        return;
+    memcpy(bus.buffers[next].image, bus.image, sizeof bus.image);
+    bus.buffers[next].frame = (dc1394video_frame_t){
+        .image = bus.buffers[next].image,
+        .size = {WIDTH, HEIGHT},
+        .stride = STRIDE,
+        .color_coding = DC1394_COLOR_CODING_MONO8,
+        .timestamp = (uint64_t)(real.tv_sec * INT64_C(1000000) + real.tv_nsec / 1000 - age_ms * 1000)};
+    bus.buffers[next].full = true;
+    bus.filled++;
+    wake();
+}
+
+void bus_expose(int64_t age_ms)
+{
+    LOCKED(bus_fill(age_ms));
 }
 
 void bus_unplug(void)
@@ -147,7 +156,12 @@ dc1394error_t dc1394_capture_setup(dc1394camera_t *camera, uint32_t buffers, uin
     (void)flags;
     assert(buffers >= 2);
     bus.lost += camera->guid == 0;
-    LOCKED(bus.waiting = bus.out = false; socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0, bus.fds));
+    LOCKED({
+        bus.filled = bus.taken = 0;
+        for (unsigned i = 0; i < BUS_BUFFERS; i++)
+            bus.buffers[i].full = false;
+        socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0, bus.fds);
+    });
     return DC1394_SUCCESS;
 }
 
@@ -187,9 +201,7 @@ dc1394error_t dc1394_capture_dequeue(dc1394camera_t *camera, dc1394capture_polic
     if (!present)
         return DC1394_FAILURE;
     if (read(bus.fds[0], &token, 1) == 1) {
-        bus.lost += bus.out;
-        LOCKED(bus.out = true);
-        *frame = &bus.frame;
+        LOCKED(*frame = &bus.buffers[bus.taken++ % BUS_BUFFERS].frame);
     }
     return DC1394_SUCCESS;
 }
@@ -204,8 +216,14 @@ dc1394bool_t dc1394_capture_is_frame_corrupt(dc1394camera_t *camera, dc1394video
 dc1394error_t dc1394_capture_enqueue(dc1394camera_t *camera, dc1394video_frame_t *frame)
 {
     (void)camera;
-    assert(frame == &bus.frame);
-    (void)frame;
-    LOCKED(bus.waiting = bus.out = false);
+    unsigned given = 0;
+    while (frame != &bus.buffers[given].frame)
+        assert(++given < BUS_BUFFERS);
+    LOCKED({
+        if (bus.given_back)
+            bus.given_back();
+        bus.lost += !bus.buffers[given].full;
+        bus.buffers[given].full = false;
+    });
     return DC1394_SUCCESS;
 }

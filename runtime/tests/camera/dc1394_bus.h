@@ -8,7 +8,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-enum { WIDTH = 640, HEIGHT = 480, STRIDE = 700 };
+enum { WIDTH = 640, HEIGHT = 480, STRIDE = 700, BUS_BUFFERS = 3 };
 #define GUID UINT64_C(0x00b09d0100a1b2c3)
 
 extern struct bus {
@@ -24,8 +24,13 @@ extern struct bus {
     dc1394camera_t camera;
     dc1394camera_id_t ids[2];
     dc1394camera_list_t list;
-    dc1394video_frame_t frame;
-    bool waiting, out;
+    struct {
+        dc1394video_frame_t frame;
+        uint8_t image[STRIDE * HEIGHT];
+        bool full; /* until it is given back */
+    } buffers[BUS_BUFFERS];
+    unsigned filled, taken;   /* buffers so far, in turn */
+    void (*given_back)(void); /* called before one is; may be NULL */
     uint8_t image[STRIDE * HEIGHT];
 } bus;
 
@@ -37,8 +42,11 @@ extern struct bus {
         pthread_mutex_unlock(&bus.lock);                                                                               \
     } while (0)
 
-/* Hand over `bus.image`, which is `age_ms` old, unless nobody takes images or the one before is not given back yet. */
+/* Hand over `bus.image`, which is `age_ms` old, unless nobody takes images or all buffers are full. */
 void bus_expose(int64_t age_ms);
+
+/* The same with the lock held. */
+void bus_fill(int64_t age_ms);
 
 void bus_unplug(void);
 

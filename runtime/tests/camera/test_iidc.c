@@ -25,7 +25,10 @@ static bool transmits(void)
 
 static bool taken(void)
 {
-    return !bus.waiting;
+    for (int i = 0; i < BUS_BUFFERS; i++)
+        if (bus.buffers[i].full)
+            return false;
+    return true;
 }
 
 static int looked;
@@ -35,11 +38,16 @@ static bool looked_again(void)
     return bus.looked > looked + 1;
 }
 
-static void expose(uint8_t first, int64_t age_ms)
+static void draw(uint8_t first)
 {
     for (int row = 0; row < HEIGHT; row++)
         for (int column = 0; column < STRIDE; column++)
             bus.image[row * STRIDE + column] = (uint8_t)(column < WIDTH ? first + column + row : 0xEE);
+}
+
+static void expose(uint8_t first, int64_t age_ms)
+{
+    draw(first);
     bus_expose(age_ms);
     await(taken);
 }
@@ -55,6 +63,40 @@ static void look(struct fl_block *block)
 {
     block->release_ns = fl_now_ns() - block->period_ns;
     assert_int_equal(testbed_step(block), FL_OK);
+}
+
+static struct fl_block *looking;
+static uint8_t seen[BUS_BUFFERS];
+static size_t seen_count;
+
+static void look_then(void)
+{
+    testbed_step(looking);
+    seen[seen_count++] = *(const uint8_t *)testbed_output(looking, "image");
+}
+
+/* Frames that wait for the thread: no step gets an older one. Seen to fail: steps saw 10, then 20, then 30. */
+static void passes_over_all_but_the_newest(void **state)
+{
+    (void)state;
+    bus.present = true;
+    looking = grabber(NULL, NULL);
+    await(transmits);
+    LOCKED({
+        bus.given_back = look_then;
+        for (uint8_t first = 10; first <= 10 * BUS_BUFFERS; first = (uint8_t)(first + 10)) {
+            draw(first);
+            bus_fill(0);
+        }
+    });
+    await(taken);
+    bus.given_back = NULL;
+    assert_int_equal(seen_count, BUS_BUFFERS);
+    for (size_t i = 0; i < seen_count; i++)
+        assert_int_equal(seen[i], i + 1 < seen_count ? 0 : 10 * BUS_BUFFERS);
+    assert_int_equal(GET(looking, "sequence", uint32_t), BUS_BUFFERS);
+    assert_int_equal(bus.lost, 0);
+    testbed_end(looking);
 }
 
 static void grabs(void **state)
@@ -146,6 +188,7 @@ static void refuses(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
+        cmocka_unit_test(passes_over_all_but_the_newest),
         cmocka_unit_test(grabs),
         cmocka_unit_test(waits_for_its_camera),
         cmocka_unit_test(cuts_other_sizes_out),

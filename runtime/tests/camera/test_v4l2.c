@@ -36,6 +36,9 @@ static struct {
     int opened, started;
     struct v4l2_fract interval;
     int32_t exposure;
+    struct fl_block *looking; /* it makes a step whenever a buffer is given back, */
+    uint8_t seen[8];          /* and has this brightness then */
+    size_t seen_count;
 } camera = {.lock = PTHREAD_MUTEX_INITIALIZER, .changed = PTHREAD_COND_INITIALIZER, .fd = -1, .far_fd = -1};
 
 static int refuse(int error)
@@ -124,6 +127,10 @@ static int answer(unsigned long code, void *argument)
         buffer->m.offset = buffer->index * LENGTH;
         return 0;
     case VIDIOC_QBUF:
+        if (camera.looking) {
+            testbed_step(camera.looking);
+            camera.seen[camera.seen_count++] = *(const uint8_t *)testbed_output(camera.looking, "image");
+        }
         camera.queue[camera.queued++] = buffer->index;
         return 0;
     case VIDIOC_DQBUF:
@@ -226,11 +233,10 @@ static int place_of(uint32_t format, int column)
     }
 }
 
-/* Expose a frame: pixel (column, row) has the brightness first + column + row, in the camera's format. */
-static void expose(uint8_t first, uint32_t flags, uint32_t bytes, int64_t at_ns)
+/* The same as expose, with the lock held. */
+static void fill(uint8_t first, uint32_t flags, uint32_t bytes, int64_t at_ns)
 {
     char token = 0;
-    pthread_mutex_lock(&camera.lock);
     assert_true(camera.queued > 0);
     uint32_t index = camera.queue[0];
     uint8_t *memory = camera.memory + index * LENGTH;
@@ -248,6 +254,13 @@ static void expose(uint8_t first, uint32_t flags, uint32_t bytes, int64_t at_ns)
         .timestamp = {.tv_sec = (time_t)(at_ns / 1000000000), .tv_usec = (suseconds_t)(at_ns % 1000000000 / 1000)},
     };
     assert_int_equal(write(camera.far_fd, &token, 1), 1);
+}
+
+/* Expose a frame: pixel (column, row) has the brightness first + column + row, in the camera's format. */
+static void expose(uint8_t first, uint32_t flags, uint32_t bytes, int64_t at_ns)
+{
+    pthread_mutex_lock(&camera.lock);
+    fill(first, flags, bytes, at_ns);
     pthread_mutex_unlock(&camera.lock);
     await(all_queued); /* it was taken, and its buffer given back */
 }
@@ -356,6 +369,27 @@ static void says_what_is_wrong(void **state)
         forget(state);
         said_end(&said);
     }
+}
+
+/* Frames that wait for the thread: no step gets an older one. Seen to fail: steps saw 10, then 20, then 30. */
+static void passes_over_all_but_the_newest(void **state)
+{
+    (void)state;
+    plug(V4L2_PIX_FMT_GREY);
+    struct fl_block *block = grabber(NULL, NULL);
+    await(streams);
+    pthread_mutex_lock(&camera.lock);
+    camera.looking = block;
+    for (uint8_t first = 10; first <= 10 * BUFFERS; first = (uint8_t)(first + 10))
+        fill(first, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, LENGTH, fl_now_ns());
+    pthread_mutex_unlock(&camera.lock);
+    await(all_queued);
+    camera.looking = NULL;
+    assert_int_equal(camera.seen_count, BUFFERS);
+    for (size_t i = 0; i < camera.seen_count; i++)
+        assert_int_equal(camera.seen[i], i + 1 < camera.seen_count ? 0 : 10 * BUFFERS);
+    assert_int_equal(GET(block, "sequence", uint32_t), BUFFERS);
+    testbed_end(block);
 }
 
 static void leaves_out_bad_frames(void **state)
@@ -473,6 +507,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test_teardown(grabs_each_format_with_the_brightness_in_it, forget),
         cmocka_unit_test_teardown(says_what_is_wrong, forget),
+        cmocka_unit_test_teardown(passes_over_all_but_the_newest, forget),
         cmocka_unit_test_teardown(leaves_out_bad_frames, forget),
         cmocka_unit_test_teardown(stamps_in_the_tasks_clock, forget),
         cmocka_unit_test_teardown(returns_after_unplugging, forget),
