@@ -3,7 +3,8 @@
 #ifndef FLOTILLA_PRIVILEGE_H
 #define FLOTILLA_PRIVILEGE_H
 
-/* Lock all memory, present and future, in RAM. Stacks then count in full, so threads started from now on, by libraries
+/* Lock all memory, present and future, in RAM; what is there now alone, where the limit of a user is too low for
+ * threads. Stacks then count in full, so threads started from now on, by libraries
  * too, get 256 kB of stack instead of 8 MB unless they ask for a size. */
 void privilege_lock_memory(void);
 

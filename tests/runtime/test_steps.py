@@ -14,6 +14,8 @@ from tests.runtime.tasks import PLUGIN, Tasks, compile_shared, task
 
 pytestmark = pytest.mark.clock
 
+UNPRIVILEGED = ["setpriv", "--inh-caps=-all", "--ambient-caps=-all", "--bounding-set=-all"]
+
 
 def test_signals_follow_the_wires_at_their_rates(tasks: Tasks) -> None:
     text = task(
@@ -182,11 +184,26 @@ def test_a_processor_that_is_not_there_ends_the_task(tasks: Tasks) -> None:
     assert "cpu: 1023: the task cannot run there (Invalid argument); this computer has processors 0 to " in ended.err
 
 
+def test_a_low_limit_of_locked_memory_ends_no_task(tasks: Tasks) -> None:
+    """8 MB, as an ordinary user of Debian 12 has; a driver needs a thread.
+
+    Seen to fail: "out: cannot start the driver's thread: Resource temporarily unavailable".
+    """
+    text = task(
+        "a: {type: dsp3000, parameters: {device: /dev/none}}\nb: {type: dsp3000, parameters: {device: /dev/no}}"
+    )
+    done = subprocess.run(
+        ["prlimit", "--memlock=8388608", *UNPRIVILEGED, *tasks.argv(text, "--steps", "3")],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "this user may lock 8192 kB of memory, so that later memory is not locked (CAP_IPC_LOCK or " in done.stderr
+
+
 def test_privileges_that_are_missing_are_named(tasks: Tasks) -> None:
     text = task("a: {type: gain, in: {in: 1}}", "period: 1 ms\npriority: 50")
-    argv = ["setpriv", "--inh-caps=-all", "--ambient-caps=-all", "--bounding-set=-all"]
     done = subprocess.run(
-        ["prlimit", "--rtprio=0", "--memlock=0", *argv, *tasks.argv(text, "--steps", "3")],
+        ["prlimit", "--rtprio=0", "--memlock=0", *UNPRIVILEGED, *tasks.argv(text, "--steps", "3")],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
