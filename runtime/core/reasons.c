@@ -26,7 +26,7 @@ void fl_reasons_log(struct fl_reasons *reasons, struct fl_block *block, int64_t 
     va_end(arguments);
     reasons->wrong_ns = now_ns;
     if (is_new(reasons, reason))
-        fl_log(block, "%s", reason);
+        fl_warn(block, "%s", reason);
 }
 
 void fl_reasons_good(struct fl_reasons *reasons, int64_t now_ns)

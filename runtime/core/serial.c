@@ -326,9 +326,9 @@ static void log_open(struct fl_serial *serial, int error)
         return;
     serial->open_error = error;
     if (error == ERANGE)
-        fl_log(serial->block, "%s cannot do %" PRId64 " Bd", serial->settings.device, serial->settings.baud);
+        fl_warn(serial->block, "%s cannot do %" PRId64 " Bd", serial->settings.device, serial->settings.baud);
     else if (error)
-        fl_log(serial->block, "cannot open %s: %s; retrying", serial->settings.device, strerror(error));
+        fl_warn(serial->block, "cannot open %s: %s; retrying", serial->settings.device, strerror(error));
     else
         fl_log(serial->block, "%s is open", serial->settings.device);
 }
@@ -351,8 +351,8 @@ static void run(struct fl_driver *driver, void *context)
         if (error) {
             /* Otherwise close() would wait for bytes that can no longer be sent. */
             ioctl(fd, TCFLSH, TCIOFLUSH);
-            fl_log(serial->block, "%s %s", serial->settings.device,
-                   error == ETIMEDOUT ? "accepts no more bytes: closed" : "is gone");
+            fl_warn(serial->block, "%s %s", serial->settings.device,
+                    error == ETIMEDOUT ? "accepts no more bytes: closed" : "is gone");
         }
         close(fd);
     } while (fl_driver_wait(driver, -1, false, REOPEN_MS) == 0);

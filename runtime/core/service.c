@@ -9,6 +9,8 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 static const struct {
     const char *name;
@@ -96,14 +98,47 @@ bool fl_given(const struct fl_block *block, uint32_t parameter)
     return block->service->given[parameter];
 }
 
-void fl_log(struct fl_block *block, const char *format, ...)
+static bool to_journal;
+
+void fl_priority_begin(void)
+{
+    struct stat stream;
+    char found[64];
+    const char *journal = getenv("JOURNAL_STREAM"); /* systemd.exec(5) */
+    if (!journal || fstat(STDERR_FILENO, &stream) < 0)
+        return;
+    snprintf(found, sizeof found, "%ju:%ju", (uintmax_t)stream.st_dev, (uintmax_t)stream.st_ino);
+    to_journal = strcmp(journal, found) == 0;
+}
+
+const char *fl_priority(int priority)
+{
+    if (!to_journal)
+        return "";
+    return priority <= FL_ERROR ? "<3>" : priority == FL_WARNING ? "<4>" : "<6>";
+}
+
+static void write_line(const struct fl_block *block, int priority, const char *format, va_list arguments)
 {
     char line[256];
+    vsnprintf(line, sizeof line, format, arguments);
+    fprintf(stderr, "%s%s: %s\n", fl_priority(priority), block->name, line);
+}
+
+void fl_log(struct fl_block *block, const char *format, ...)
+{
     va_list arguments;
     va_start(arguments, format);
-    vsnprintf(line, sizeof line, format, arguments);
+    write_line(block, FL_INFO, format, arguments);
     va_end(arguments);
-    fprintf(stderr, "%s: %s\n", block->name, line);
+}
+
+void fl_warn(struct fl_block *block, const char *format, ...)
+{
+    va_list arguments;
+    va_start(arguments, format);
+    write_line(block, FL_WARNING, format, arguments);
+    va_end(arguments);
 }
 
 static int add_port(struct fl_block *block, struct fl_port **ports, uint32_t *count, struct fl_port port)

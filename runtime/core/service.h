@@ -57,6 +57,16 @@ struct fl_service {
     bool overrun_ends; /* why the step failed */
 };
 
+/* Of a line of the journal (syslog(3)). */
+enum { FL_ERROR = 3, FL_WARNING = 4, FL_INFO = 6 };
+
+/* For a program whose standard error may be the journal; before its first line. */
+void fl_priority_begin(void);
+
+/* What a line on the standard error begins with: its priority where that is the journal (sd-daemon(3)), else nothing.
+ * In signal handlers, too. */
+const char *fl_priority(int priority);
+
 /* Whether an output's type and width go with its flags. */
 bool fl_output_possible(const struct fl_port *port);
 

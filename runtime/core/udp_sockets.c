@@ -87,8 +87,8 @@ static int replace_all(const struct udp_sockets *sockets)
     }
     char address[INET_ADDRSTRLEN];
     if (early)
-        fl_log(sockets->block, "%s is not an address of this computer yet: waiting for it",
-               inet_ntop(AF_INET, &sockets->local.sin_addr, address, sizeof address));
+        fl_warn(sockets->block, "%s is not an address of this computer yet: waiting for it",
+                inet_ntop(AF_INET, &sockets->local.sin_addr, address, sizeof address));
     return 0;
 }
 
@@ -105,11 +105,14 @@ static void follow(struct udp_sockets *sockets)
     if (error) { /* tried again */
         say_why(sockets, error, text, sizeof text);
         if (error != sockets->error)
-            fl_log(sockets->block, "%s", text);
+            fl_warn(sockets->block, "%s", text);
         sockets->error = error;
         return;
     }
-    fl_log(sockets->block, "network interface %s is %s", sockets->interface, index ? "there" : "gone: waiting for it");
+    if (index)
+        fl_log(sockets->block, "network interface %s is there", sockets->interface);
+    else
+        fl_warn(sockets->block, "network interface %s is gone: waiting for it", sockets->interface);
     sockets->error = 0;
     sockets->index = index;
 }
@@ -165,7 +168,7 @@ int udp_sockets_open(struct udp_sockets *sockets, struct fl_block *block, size_t
     if (!*interface)
         return FL_OK;
     if (!sockets->index)
-        fl_log(block, "there is no network interface %s yet: waiting for it", interface);
+        fl_warn(block, "there is no network interface %s yet: waiting for it", interface);
     return watch_interfaces(sockets);
 }
 

@@ -11,6 +11,8 @@
 #include "status.h"
 #include "tuner.h"
 
+#include "core/service.h"
+
 #include <errno.h>
 #include <inttypes.h>
 #include <poll.h>
@@ -132,10 +134,11 @@ bool executive_make_safe(struct task *task)
     /* Report only after all outputs are safe: the reader of stderr may be slow. */
     for (size_t i = 0; i < task->count; i++)
         if (task->blocks[i].failed)
-            fprintf(stderr, "%s: %s\n", task->blocks[i].block->name, task->blocks[i].block->service->failure);
+            fprintf(stderr, "%s%s: %s\n", fl_priority(FL_ERROR), task->blocks[i].block->name,
+                    task->blocks[i].block->service->failure);
     bool safe = safety_outcome(task, text, sizeof text);
     if (!safe)
-        fprintf(stderr, "flotilla: %s: %s\n", task->name, text);
+        fprintf(stderr, "%sflotilla: %s: %s\n", fl_priority(FL_ERROR), task->name, text);
     return safe;
 }
 
@@ -149,8 +152,8 @@ static void gather_rates(const struct executive *executive)
         int error = block->service->rates && !block->service->rates_in_turn ? rates_gather(block) : 0;
         if (!error)
             continue;
-        fprintf(stderr, "%s: its rates cannot share one processor (%s): each step waits for the slower ones\n",
-                block->name, strerror(error));
+        fprintf(stderr, "%s%s: its rates cannot share one processor (%s): each step waits for the slower ones\n",
+                fl_priority(FL_WARNING), block->name, strerror(error));
         rates_in_turn(block);
     }
 }
@@ -473,8 +476,8 @@ static void serve_parameters(const struct executive *executive)
 {
     int error = executive->options->tuner ? tuner_start(executive->options->tuner, executive->status) : 0;
     if (error)
-        fprintf(stderr, "flotilla: %s: no thread for parameters (%s): they stay as they are\n", executive->task->name,
-                strerror(error));
+        fprintf(stderr, "%sflotilla: %s: no thread for parameters (%s): they stay as they are\n",
+                fl_priority(FL_WARNING), executive->task->name, strerror(error));
 }
 
 /* Move to the task's processor, before anything is started that has to run there. */

@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "privilege.h"
 
+#include "core/service.h"
+
 #include <errno.h>
 #include <inttypes.h>
 #include <linux/capability.h>
@@ -52,11 +54,12 @@ void privilege_lock_memory(void)
     /* Where future memory is locked, too, no thread starts beyond the limit. */
     const uint64_t bytes = lockable();
     if (mlockall(bytes < ENOUGH_BYTES ? MCL_CURRENT : MCL_CURRENT | MCL_FUTURE) < 0)
-        fprintf(stderr, "flotilla: memory cannot be locked: %s %s\n", strerror(errno), consequence);
+        fprintf(stderr, "%sflotilla: memory cannot be locked: %s %s\n", fl_priority(FL_WARNING), strerror(errno),
+                consequence);
     else if (bytes < ENOUGH_BYTES)
         fprintf(stderr,
-                "flotilla: this user may lock %" PRIu64 " kB of memory, so that later memory is not locked %s\n",
-                bytes / 1024, consequence);
+                "%sflotilla: this user may lock %" PRIu64 " kB of memory, so that later memory is not locked %s\n",
+                fl_priority(FL_WARNING), bytes / 1024, consequence);
 }
 
 int privilege_priority(int priority, const char *consequence)
@@ -66,8 +69,8 @@ int privilege_priority(int priority, const char *consequence)
         return 0;
     int policy = sched_getscheduler(0);
     if (sched_getparam(0, &before) < 0 || sched_setscheduler(0, SCHED_FIFO, &wanted) < 0) {
-        fprintf(stderr, "flotilla: SCHED_FIFO %d is refused (%s; CAP_SYS_NICE or LimitRTPRIO=): %s\n", priority,
-                strerror(errno), consequence);
+        fprintf(stderr, "%sflotilla: SCHED_FIFO %d is refused (%s; CAP_SYS_NICE or LimitRTPRIO=): %s\n",
+                fl_priority(FL_WARNING), priority, strerror(errno), consequence);
         return 0;
     }
     sched_setscheduler(0, policy, &before);

@@ -1,10 +1,13 @@
 #include "problem.h"
 
+#include "core/service.h"
+
 void problem(struct problems *problems, unsigned line, const char *format, ...)
 {
     va_list arguments;
     va_start(arguments, format);
     problems->count++;
+    fputs(fl_priority(FL_ERROR), problems->out);
     if (line)
         fprintf(problems->out, "%s:%u: ", problems->file, line);
     else

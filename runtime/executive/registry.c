@@ -58,14 +58,14 @@ static unsigned add(struct registry *registry, const struct fl_block_type *const
     for (size_t i = 0; i < count; i++) {
         const struct fl_block_type *type = types[i];
         if (type->abi != FL_ABI) { /* the rest of it cannot be read */
-            fprintf(out, "%s: built for block interface %u, this runtime has %u; rebuild it\n", origin, type->abi,
-                    FL_ABI);
+            fprintf(out, "%s%s: built for block interface %u, this runtime has %u; rebuild it\n",
+                    fl_priority(FL_WARNING), origin, type->abi, FL_ABI);
             faults++;
             continue;
         }
         const char *wrong = fault(registry, type);
         if (wrong) {
-            fprintf(out, "%s: block %s: %s\n", origin, type->name ? type->name : "?", wrong);
+            fprintf(out, "%s%s: block %s: %s\n", fl_priority(FL_WARNING), origin, type->name ? type->name : "?", wrong);
             faults++;
             continue;
         }
@@ -88,12 +88,12 @@ static unsigned add_plugin(struct registry *registry, const char *path)
     void *library = dlopen(path, RTLD_NOW | RTLD_LOCAL);
     size_t count = 0;
     if (!library) {
-        fprintf(out, "%s\n", dlerror());
+        fprintf(out, "%s%s\n", fl_priority(FL_WARNING), dlerror());
         return 1;
     }
     found.symbol = dlsym(library, "fl_blocks");
     if (!found.symbol) {
-        fprintf(out, "%s: defines no block; use FL_BLOCK of flotilla/block.h\n", path);
+        fprintf(out, "%s%s: defines no block; use FL_BLOCK of flotilla/block.h\n", fl_priority(FL_WARNING), path);
         dlclose(library);
         return 1;
     }

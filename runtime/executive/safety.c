@@ -177,10 +177,10 @@ static void report_crash(int number, const siginfo_t *info, const struct fl_bloc
     prctl(PR_GET_NAME, thread);
     dladdr((void *)at, &place); /* NOLINT(performance-no-int-to-ptr): the kernel has it as a number */
     const char *name = sigabbrev_np(number), *file = place.dli_fname ? strrchr(place.dli_fname, '/') : NULL;
-    int used =
-        snprintf(text, sizeof text, "flotilla: %s %s: SIG%s at address 0x%" PRIxPTR ", in %s+0x%" PRIxPTR,
-                 running ? "block" : "thread", running ? running->name : thread, name ? name : "?",
-                 (uintptr_t)info->si_addr, file ? file + 1 : "code that no file has", at - (uintptr_t)place.dli_fbase);
+    int used = snprintf(text, sizeof text, "%sflotilla: %s %s: SIG%s at address 0x%" PRIxPTR ", in %s+0x%" PRIxPTR,
+                        fl_priority(FL_ERROR), running ? "block" : "thread", running ? running->name : thread,
+                        name ? name : "?", (uintptr_t)info->si_addr, file ? file + 1 : "code that no file has",
+                        at - (uintptr_t)place.dli_fbase);
     if (place.dli_sname && used > 0 && (size_t)used < sizeof text)
         used += snprintf(text + used, sizeof text - (size_t)used, " (%s)", place.dli_sname);
     size_t length = used > 0 && (size_t)used < sizeof text - 1 ? (size_t)used : sizeof text - 2;
@@ -194,6 +194,7 @@ static void handle(int number, siginfo_t *info, void *context)
     const struct fl_block *running = safety_running;
     if (number == OWN_SIGNAL && info->si_code == SI_TIMER) {
         const struct fl_block *block = atomic_load(&safety.terminating);
+        say(fl_priority(FL_ERROR));
         say("flotilla: ");
         say(block ? block->name : "the end");
         _exit(say_outcome(block ? " does not end; " : " took too long; ") ? 1 : SAFETY_UNKNOWN);
@@ -207,8 +208,10 @@ static void handle(int number, siginfo_t *info, void *context)
     report_crash(number, info, running, (uintptr_t)((ucontext_t *)context)->uc_mcontext.gregs[PROGRAM_COUNTER]);
     const struct task *task = atomic_load(&safety.task);
     char text[SAFETY_OUTCOME];
-    if (task && getpid() == safety.process && !safety_outcome(task, text, sizeof text))
+    if (task && getpid() == safety.process && !safety_outcome(task, text, sizeof text)) {
+        say(fl_priority(FL_ERROR));
         say_outcome("flotilla: ");
+    }
     /* The status, and the core if there is one, say what it died of. */
     signal(number, SIG_DFL);
     raise(number);
@@ -217,6 +220,7 @@ static void handle(int number, siginfo_t *info, void *context)
 void safety_abandon(const char *text)
 {
     stop_outputs();
+    say(fl_priority(FL_ERROR));
     _exit(say_outcome(text) ? 1 : SAFETY_UNKNOWN);
 }
 

@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "tuner.h"
 
+#include "core/service.h"
+
 #include "block.h"
 #include "client.h"
 #include "status.h"
@@ -305,7 +307,8 @@ static void serve_client(struct tuner *tuner, struct client *client)
         bool done = obey(tuner, client);
         fflush(client->answer);
         if (done && setting)
-            fprintf(stderr, "flotilla: %s: user %u: %s", tuner->task->name, (unsigned)client->user, text + 3);
+            fprintf(stderr, "%sflotilla: %s: user %u: %s", fl_priority(FL_INFO), tuner->task->name,
+                    (unsigned)client->user, text + 3);
         if (!done && fseek(client->answer, 0, SEEK_SET) == 0)
             fprintf(client->answer, "error\n%s\n", client->reason);
         fflush(client->answer);
@@ -382,7 +385,7 @@ struct tuner *tuner_create(const char *path, struct task *task)
     *tuner = (struct tuner){.task = task, .path = strdup(path)};
     tuner->listen_fd = listening(path);
     if (tuner->listen_fd < 0) {
-        fprintf(stderr, "flotilla: %s: %s: parameters cannot be set while it runs\n", path,
+        fprintf(stderr, "%sflotilla: %s: %s: parameters cannot be set while it runs\n", fl_priority(FL_WARNING), path,
                 errno == EADDRINUSE ? "it exists, and is another task's socket or not a socket" : strerror(errno));
         free(tuner->path);
         free(tuner);

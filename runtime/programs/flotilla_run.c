@@ -1,5 +1,6 @@
 /* flotilla-run: runs the task of a file, or reports what is wrong with it. */
 #define _GNU_SOURCE
+#include "core/service.h"
 #include "executive/executive.h"
 #include "executive/instance.h"
 #include "executive/safety.h"
@@ -126,7 +127,7 @@ static bool find_watched(struct command *command, const struct task *task)
         each->name = name;
         each->signal = task_signal(task, name, &each->type, &each->width, reason, sizeof reason);
         if (!each->signal) {
-            fprintf(stderr, "flotilla-run: --watch %s\n", reason);
+            fprintf(stderr, "%sflotilla-run: --watch %s\n", fl_priority(FL_ERROR), reason);
             free(watched);
             return false;
         }
@@ -142,7 +143,7 @@ static bool write_statistics(const char *path, const struct task *task, const st
     if (out)
         executive_write_statistics(task, result, out);
     if (!out || fclose(out) != 0) {
-        fprintf(stderr, "flotilla-run: --statistics %s: %s\n", path, strerror(errno));
+        fprintf(stderr, "%sflotilla-run: --statistics %s: %s\n", fl_priority(FL_ERROR), path, strerror(errno));
         return false;
     }
     return true;
@@ -165,9 +166,10 @@ static int run(struct command *command, struct task *task)
     struct run_result result;
     int holder = instance_lock(command->path);
     if (holder > 0)
-        fprintf(stderr, "flotilla-run: %s runs already, as process %d; end that first\n", command->path, holder);
+        fprintf(stderr, "%sflotilla-run: %s runs already, as process %d; end that first\n", fl_priority(FL_ERROR),
+                command->path, holder);
     else if (holder < 0)
-        fprintf(stderr, "flotilla-run: %s: %s\n", command->path, strerror(errno));
+        fprintf(stderr, "%sflotilla-run: %s: %s\n", fl_priority(FL_ERROR), command->path, strerror(errno));
     if (holder)
         return 3;
     if (!open_control(command, task))
@@ -177,7 +179,9 @@ static int run(struct command *command, struct task *task)
     tuner_destroy(command->run.tuner);
     bool written = !command->statistics || write_statistics(command->statistics, task, &result);
     if (result.ending != ENDING_ASKED || !result.safe)
-        fprintf(stderr, "flotilla: %s: %s; %s\n", task->name, result.reason, result.outputs);
+        fprintf(stderr, "%sflotilla: %s: %s; %s\n",
+                fl_priority(result.safe && result.ending == ENDING_DONE ? FL_INFO : FL_ERROR), task->name,
+                result.reason, result.outputs);
     if (!result.safe)
         return SAFETY_UNKNOWN;
     return (result.ending == ENDING_ASKED || result.ending == ENDING_DONE) && written ? 0 : 1;
@@ -189,6 +193,7 @@ int main(int argc, char **argv)
     struct registry registry = {0};
     struct task task;
     int status = 0;
+    fl_priority_begin();
     signal(SIGPIPE, SIG_IGN); /* a reader that has gone must not end a control task */
     if (!parse(&command, argc, argv))
         return 2;

@@ -369,3 +369,34 @@ def test_outputs_are_reset_where_nobody_hears_of_a_failure(tasks: Tasks, tmp_pat
     status = subprocess.run(argv, stderr=broken, timeout=60, check=False).returncode
     os.close(broken)
     assert (status, device.read_text().split()) == (4, ["safe", "terminated"])
+
+
+def lines_of(tasks: Tasks, text: str, *options: str, journal: bool = True) -> list[str]:
+    """What the task writes to a stream that it is told, or not, to be the journal (systemd.exec(5), sd-daemon(3))."""
+    read, write = os.pipe()
+    with os.fdopen(read, encoding="utf-8") as lines:
+        stream = os.fstat(write)
+        told = {"JOURNAL_STREAM": f"{stream.st_dev}:{stream.st_ino if journal else 1}"}
+        subprocess.run(tasks.argv(text, *options), stderr=write, env={**os.environ, **told}, timeout=60, check=False)
+        os.close(write)
+        return lines.readlines()
+
+
+@pytest.mark.parametrize(
+    ("block", "options", "start"),
+    [
+        ("{type: misbehave, parameters: {manner: fail}}", (), "<3>flotilla: "),
+        ("{type: misbehave, parameters: {manner: fault}}", (), "<3>flotilla: block a: SIGSEGV "),
+        ("{type: misbehave, parameters: {manner: exit}}", (), "<3>flotilla: a block has called exit(); "),
+        ("{type: none}", (), "<3>"),
+        ("{type: urg, parameters: {device: /dev/none}}", ("--steps", "1"), "<4>a: cannot open /dev/none: "),
+    ],
+)
+def test_lines_of_the_journal_have_their_priority(
+    tasks: Tasks, block: str, options: tuple[str, ...], start: str
+) -> None:
+    """None elsewhere. Seen to fail: no line had one, so that all were information."""
+    text = task("a: " + block)
+    (line,) = lines_of(tasks, text, *options)
+    assert line.startswith(start)
+    assert lines_of(tasks, text, *options, journal=False) == [line[3:]]

@@ -195,26 +195,26 @@ static void log_trouble(struct fl_block *block, const struct epos2_trouble *trou
     int node = (int)set->node;
     switch (trouble->cause) {
     case EPOS2_NO_ANSWER:
-        fl_log(block, "drive %d does not answer: check its power, cable, node address and bit rate; retrying", node);
+        fl_warn(block, "drive %d does not answer: check its power, cable, node address and bit rate; retrying", node);
         break;
     case EPOS2_NO_HEARTBEAT:
-        fl_log(block, "drive %d: no heartbeat for %g s: check its power and cable; retrying", node, set->heartbeat);
+        fl_warn(block, "drive %d: no heartbeat for %g s: check its power and cable; retrying", node, set->heartbeat);
         break;
     case EPOS2_ABORTED:
-        fl_log(block, "drive %d refuses object %04X:%02X: SDO abort code %08X, %s; retrying", node, trouble->index,
-               trouble->sub, (unsigned)trouble->code, epos2_abort_text(trouble->code));
+        fl_warn(block, "drive %d refuses object %04X:%02X: SDO abort code %08X, %s; retrying", node, trouble->index,
+                trouble->sub, (unsigned)trouble->code, epos2_abort_text(trouble->code));
         break;
     case EPOS2_EMERGENCY:
-        fl_log(block, "drive %d has a fault: EMCY error code %04X, %s", node, (unsigned)trouble->code,
-               epos2_error_text((uint16_t)trouble->code));
+        fl_warn(block, "drive %d has a fault: EMCY error code %04X, %s", node, (unsigned)trouble->code,
+                epos2_error_text((uint16_t)trouble->code));
         break;
     case EPOS2_NOT_HOMED:
-        fl_log(block,
-               trouble->code ? "drive %d did not find its home within %g s: check its switch or end stop; the motor "
-                               "stays off until `enable` goes from 0 to 1"
-                             : "drive %d says that its search for the home failed, status bit 13: check its switch or "
-                               "end stop; the motor stays off until `enable` goes from 0 to 1",
-               node, set->homing_timeout);
+        fl_warn(block,
+                trouble->code ? "drive %d did not find its home within %g s: check its switch or end stop; the motor "
+                                "stays off until `enable` goes from 0 to 1"
+                              : "drive %d says that its search for the home failed, status bit 13: check its switch or "
+                                "end stop; the motor stays off until `enable` goes from 0 to 1",
+                node, set->homing_timeout);
         break;
     case EPOS2_FINE:
     default:

@@ -92,30 +92,30 @@ static void log_state(struct can_socket *can, int state)
         fl_log(can->block, "CAN interface %s is up", interface);
         break;
     case BUS_OFF:
-        fl_log(can->block,
-               "CAN interface %s is bus-off: check cable, termination and bit rate; whether it tries again by itself "
-               "is said under `can:` in the inventory",
-               interface);
+        fl_warn(can->block,
+                "CAN interface %s is bus-off: check cable, termination and bit rate; whether it tries again by itself "
+                "is said under `can:` in the inventory",
+                interface);
         break;
     case DOWN:
-        fl_log(can->block, "CAN interface %s is down: name it under `can:` in the inventory, with the bus's bit rate",
-               interface);
+        fl_warn(can->block, "CAN interface %s is down: name it under `can:` in the inventory, with the bus's bit rate",
+                interface);
         break;
     case NO_CAN:
-        fl_log(can->block, "%s is not a CAN interface: set the parameter `interface`", interface);
+        fl_warn(can->block, "%s is not a CAN interface: set the parameter `interface`", interface);
         break;
     case MISSING:
-        fl_log(can->block,
-               "there is no CAN interface %s: plug it in, and name it under `can:` in the inventory; waiting for it",
-               interface);
+        fl_warn(can->block,
+                "there is no CAN interface %s: plug it in, and name it under `can:` in the inventory; waiting for it",
+                interface);
         break;
     case EAFNOSUPPORT:
     case EPROTONOSUPPORT:
-        fl_log(can->block, "CAN interface %s: the kernel has no CAN: load the modules can and can-raw; retrying",
-               interface);
+        fl_warn(can->block, "CAN interface %s: the kernel has no CAN: load the modules can and can-raw; retrying",
+                interface);
         break;
     default:
-        fl_log(can->block, "CAN interface %s: %s; retrying", interface, strerror(state));
+        fl_warn(can->block, "CAN interface %s: %s; retrying", interface, strerror(state));
         break;
     }
 }

@@ -1,6 +1,8 @@
 #define _GNU_SOURCE
 #include "endpoint.h"
 
+#include "core/service.h"
+
 #include <dds/ddsrt/log.h>
 #include <math.h>
 #include <pthread.h>
@@ -62,7 +64,11 @@ static void write_log(void *context, const dds_log_data_t *data)
         if (!*why)
             snprintf(why, WHY_BYTES, "%.*s", length, text);
     } else if (is_new(data->file, data->line)) {
-        fprintf(stderr, "DDS: %.*s\n", length, text);
+        fprintf(stderr, "%sDDS: %.*s\n",
+                fl_priority(data->priority & (DDS_LC_ERROR | DDS_LC_FATAL) ? FL_ERROR
+                            : data->priority & DDS_LC_WARNING              ? FL_WARNING
+                                                                           : FL_INFO),
+                length, text);
     }
 }
 
@@ -116,8 +122,8 @@ static void log_domain(struct fl_block *block, struct domain *domain, const char
         return;
     domain->missing = missing;
     if (missing)
-        fl_log(block, "DDS domain %u: %s; retrying", (unsigned)domain->number,
-               *reason ? reason : dds_strretcode(domain->participant));
+        fl_warn(block, "DDS domain %u: %s; retrying", (unsigned)domain->number,
+                *reason ? reason : dds_strretcode(domain->participant));
     else
         fl_log(block, "DDS domain %u is available", (unsigned)domain->number);
 }

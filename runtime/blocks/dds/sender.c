@@ -57,7 +57,7 @@ static void keep_instance(struct dds_sender *sender, dds_entity_t writer)
     sender->encode(sender->block, sender->first, sender->storage);
     dds_return_t registered = dds_register_instance(writer, &handle, sender->storage);
     if (registered != DDS_RETCODE_OK)
-        fl_log(sender->block, "topic %s: instance: %s", sender->topic.name, dds_strretcode(registered));
+        fl_warn(sender->block, "topic %s: instance: %s", sender->topic.name, dds_strretcode(registered));
 }
 
 static void serve(void *context, struct fl_driver *driver, dds_entity_t writer)

@@ -286,7 +286,7 @@ static void close_file(struct writer *writer)
 static void give_up(struct state *state, const char *what)
 {
     const struct recorder *recorder = state->block->parameters;
-    fl_log(state->block, "recording to %s stops: %s: %s", recorder->directory, what, strerror(errno));
+    fl_warn(state->block, "recording to %s stops: %s: %s", recorder->directory, what, strerror(errno));
     atomic_store(&state->recording, false);
     close_file(&state->writer);
 }
@@ -362,7 +362,7 @@ static void write_batch(struct state *state, uint32_t count)
         return;
     atomic_fetch_add(&state->unwritten, count - whole);
     if (ftruncate(writer->fd, (off_t)writer->written) < 0)
-        fl_log(state->block, "half a record stays at the end: %s", strerror(errno));
+        fl_warn(state->block, "half a record stays at the end: %s", strerror(errno));
     errno = error;
     give_up(state, "write");
 }

@@ -213,6 +213,9 @@ bool fl_may_act(struct fl_block *block, bool off);
 /* Write a line to the journal; not in a step. */
 void fl_log(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
+/* The same as a warning: something does not work. */
+void fl_warn(struct fl_block *block, const char *format, ...) __attribute__((format(printf, 2, 3)));
+
 /* Add a port from `configure`. The strings must live as long as the block: constants, or fl_allocate()'s. */
 int fl_add_input(struct fl_block *block, struct fl_port port);
 int fl_add_output(struct fl_block *block, struct fl_port port);
