@@ -6,6 +6,7 @@ import filecmp
 import hashlib
 import json
 import re
+import shlex
 import stat
 import struct
 import subprocess
@@ -27,6 +28,7 @@ from images.builder.build import image_of
 from images.builder.card import Partition
 from images.builder.lock import read_lock
 from images.builder.tools import Tools
+from tests.running import PATIENCE
 
 MEBIBYTE = 1 << 20
 EMPTY = environment_block.make({}, card.HEADER_BYTES)
@@ -570,6 +572,42 @@ def _walk(
             yield from _walk(names, mode, path)
         else:
             yield path
+
+
+TIME = """
+ip link set lo up
+serve() {{
+    address=$1
+    shift
+    printf '%s\\n' "bindaddress $address" allow "cmdport 0" "bindcmdaddress /" "pidfile $PWD/$address.pid" "$@" \\
+        >"$address.conf"
+    {chronyd} -x -d -u root -f "$PWD/$address.conf" 2>"$address.log" &
+}}
+serve 127.0.0.1 "local stratum 10 orphan"; robot=$!
+serve 127.0.0.2 "bindacqaddress 127.0.0.2" "server 127.0.0.1 iburst minpoll -4 maxpoll -4" \\
+    "server 127.0.0.3 iburst minpoll -2 maxpoll -2 offset 3600" "log tracking" "logdir $PWD" {configuration}; tested=$!
+until [ "$(grep -c 127.0.0.1 tracking.log)" -gt 3 ]; do sleep 0.1; done
+serve 127.0.0.3 "local stratum 1"; station=$!
+until grep "System clock wrong by 3[56]..[.0-9]* seconds" 127.0.0.2.log; do sleep 0.1; done
+kill $robot $tested $station
+wait
+"""
+"""A robot follows another one, then a station whose clock is an hour ahead."""
+
+
+def test_a_station_that_comes_late_sets_the_clock(root: Root, tmp_path: Path) -> None:
+    """However long the robots had followed each other. The clock is this computer's, which chronyd may not step.
+
+    Seen to fail: after three updates by another robot the hour was to be slewed, which takes 12 hours.
+    """
+    template = (paths.OVERLAY / "etc/chrony/chrony.conf.j2").read_text()
+    kept = re.findall(r"^(?:local|makestep) .*$", template, re.MULTILINE)
+    chronyd = tools.command(root.directory, "usr/sbin/chronyd", root.board.architecture)
+    script = TIME.format(chronyd=shlex.join(chronyd), configuration=shlex.join(kept))
+    argv = ["unshare", "--net", "sh", "-euc", script]
+    subprocess.run(argv, cwd=tmp_path, timeout=PATIENCE, stdout=subprocess.DEVNULL, check=True)
+    said = (tmp_path / "127.0.0.2.log").read_text()
+    assert "Could not step system clock" in said, said
 
 
 # Beside the image
