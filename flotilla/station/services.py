@@ -22,6 +22,7 @@ from flotilla.common.processes import DIE_WITH_PARENT
 from flotilla.common.text import shown
 from flotilla.fleet.model import Robot
 from flotilla.robot import ssh
+from flotilla.robot.health import READ_ONLY
 
 ASK_S = 5
 _END = "."
@@ -32,6 +33,8 @@ _FLOOD = "nft --json list chain inet flotilla flood"
 """What the robot's firewall dropped as too many; /etc/nftables.conf."""
 _TIME = "echo $(chronyc -n ntpdata 2>/dev/null | grep RX)"
 """Answers of time servers: how many came, and how many were valid."""
+_DATA = "echo $(findmnt -rno VFS-OPTIONS,FS-OPTIONS /data 2>/dev/null)"
+"""How the data partition is mounted; ext4 makes it read-only after an error."""
 _PROPERTIES = ("Id", "ActiveState", "SubState", "NRestarts", "ActiveEnterTimestampMonotonic")
 _SETTINGS = ("ServerAliveInterval=5", "ServerAliveCountMax=4")
 """A busy robot takes its time to let somebody in: no less than `ssh.options` gives every command."""
@@ -116,21 +119,21 @@ class Answer:
     """By name."""
     notes: tuple[str, ...] = ()
     """What else is to be said of it: how often it lost its place in the ad hoc cell, and why; what its firewall dropped
-    as a flood; answers that were no time server's."""
+    as a flood; answers that were no time server's; a data partition that is read-only."""
 
 
 def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, None]:
     """What it says, again and again, until UserError says why it does not answer any more. `shared`: options of ssh by
     which others use the connection, too."""
     units = [f"flotilla-task@{task}.service" for task in robot.control_tasks]
-    longest = 4 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
+    longest = 5 + len(units) * (len(_PROPERTIES) + 2)  # lines of an answer
     show = shlex.join(["systemctl", "show", f"--property={','.join(_PROPERTIES)}", *units])
     # One line for each task, whatever it writes.
     status = "; ".join(
         f"printf '%s\\n' \"$(flotilla-param --status=json {task} 2>/dev/null | head -c {_LONGEST} | tr -d '\\n')\""
         for task in robot.control_tasks
     )
-    notes = f"cat {_CELL} 2>/dev/null || echo; {_FLOOD} 2>/dev/null || echo null; {_TIME}"
+    notes = f"cat {_CELL} 2>/dev/null || echo; {_FLOOD} 2>/dev/null || echo null; {_TIME}; {_DATA}"
     script = f"while cat /proc/uptime && {show} && {{ {status}; {notes}; }} && echo {_END}; do sleep {ASK_S}; done"
     before: dict[str, State] = {}
     program, *way = ssh.command(robot)
@@ -151,10 +154,10 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
                     lines.append(line)
                     continue
                 try:
-                    *lines, cell, flood, clock = lines
+                    *lines, cell, flood, clock, data = lines
                     reports, odd = _reports(robot.control_tasks, lines[-len(units) :], before)
                     before = _states(lines[: -len(units)], robot.control_tasks, reports)
-                    answer = Answer(before, (*odd, *_notes(cell.strip(), json.loads(flood), clock)))
+                    answer = Answer(before, (*odd, *_notes(cell.strip(), json.loads(flood), clock, data)))
                 except _NONSENSE as error:
                     what = shown(repr(error)[:200])
                     raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {what}") from error
@@ -165,8 +168,9 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
             process.kill()
 
 
-def _notes(cell: str, flood: dict[str, Any] | None, clock: str) -> Iterator[str]:
-    """`flood`: a chain as libnftables-json(5) describes it; None: the robot has none. `clock`: of all time servers."""
+def _notes(cell: str, flood: dict[str, Any] | None, clock: str, data: str) -> Iterator[str]:
+    """`flood`: a chain as libnftables-json(5) describes it; None: the robot has none. `clock`: of all time servers.
+    `data`: options of the mount and of the file system."""
     if cell not in ("", _IN_THE_CELL):
         yield f"radio {shown(cell[:_WORDS])}"
     rules = [each["rule"]["expr"] for each in flood["nftables"] if "rule" in each] if flood else []
@@ -175,6 +179,8 @@ def _notes(cell: str, flood: dict[str, Any] | None, clock: str) -> Iterator[str]
     came, valid = (sum(map(int, re.findall(rf"{name} *: (\d+)", clock))) for name in ("Total RX", "Total valid RX"))
     if came > valid:
         yield f"clock refused {came - valid} answers that were not a time server's"
+    if "ro" in re.split("[ ,]", data.strip()):
+        yield READ_ONLY
 
 
 def _states(lines: list[str], tasks: Sequence[str], reports: Mapping[str, TaskStatus]) -> dict[str, State]:
