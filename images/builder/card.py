@@ -42,7 +42,7 @@ from images.builder.tools import Tools
 
 MIB = 1 << 20
 _GRUB_MODULES = (
-    "memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot iorw regexp probe"
+    "memdisk tar linux normal configfile loadenv test true echo serial terminal sleep reboot iorw regexp probe cpuid"
 )
 
 

@@ -21,7 +21,7 @@ from images.builder.lock import read_lock
 from images.builder.tools import Tools
 from lab.qemu import qemu
 from lab.qemu.boot_loader import BootLoader, Started, State, StubCard, header_place, initrd_place, kernel_place
-from lab.qemu.stub_computer import assemble
+from lab.qemu.stub_computer import GAVE_UP, assemble
 
 ROBOT = 3
 UEFI_ROBOT = 2
@@ -392,3 +392,34 @@ def test_a_configuration_that_believes_the_state_is_refused(
         ):
             with pytest.raises(AssertionError, match=f"{name}: no slot was started"):
                 check(trusting, name, state)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cpu", "lacks"),
+    [
+        ({"kernel": "debian"}, "pentium3", ""),
+        ({"kernel": "debian"}, "pentium3,-pae", "PAE"),
+        ({"architecture": "amd64"}, "pentium3", "long mode"),
+        ({"kernel": "lean"}, "pentium3,-pae", ""),
+    ],
+)
+def test_a_processor_that_the_kernel_does_not_run_on_is_named(
+    board: Board,
+    stubbed: StubCard,
+    toolset: Tools,
+    session_artefacts: Path,
+    tmp_path: Path,
+    changes: dict[str, str],
+    cpu: str,
+    lacks: str,
+) -> None:
+    """Seen to fail: the kernel was started, which a real one does not report on such a processor."""
+    other = board.model_copy(update=changes | {"qemu": board.qemu.model_copy(update={"cpu": cpu})})
+    head = stubbed.with_core(card.grub_core(other, toolset, tmp_path, card.grub_config(other)))
+    with BootLoader(
+        other, stubbed, session_artefacts / f"processor-{'-'.join(changes.values())}-{cpu}", head=head
+    ) as loader:
+        loader.plant({})
+        lacking = "its kernel needs (.*), which this processor does not have"
+        found = loader.console.expect(rf"{lacking}|stub kernel: |{GAVE_UP}", SECONDS)
+        assert (found[1] or "") == lacks
