@@ -11,6 +11,10 @@ unfit = a path with blanks or with a character that means something to a shell;
 $(if $(call in_path,CURDIR),$(error $(CURDIR): this checkout lies on $(unfit) move it))
 $(foreach name,FLEET BUILD KEYS APPS INVENTORY,$(if $(call in_path,$(name)),$(error $(name)=$(value $(name)): is $(unfit) \
     take another directory)))
+# With sudo, what make writes would belong to root; flotilla/common/sudo.py refuses in the same words.
+as_root := $(if $(filter-out 0,$(value SUDO_UID)),$(filter-out fleet-scale help,$(or $(MAKECMDGOALS),help)))
+$(if $(as_root),$(if $(filter 0,$(shell id -u)),$(if $(filter 0,$(shell stat -c %u .)),,$(error make $(as_root) needs no root: \
+    run it without sudo))))
 export BUILD
 # Names of files are UTF-8 in any user's locale: the virtual environment has the path of the checkout in its files.
 export LC_ALL := C.UTF-8

@@ -170,7 +170,7 @@ COMMANDS = (
             _wheeled_arguments, packages="station"),
     Command("Lab", "wheeled-down", "end the wheeled robots", _wheeled_down, packages="station"),
     Command("Lab", "fleet-scale", "measure how provisioning grows with the fleet", _fleet_scale,
-            _fleet_scale_arguments, packages="station"),
+            _fleet_scale_arguments, packages="station", root=True),
     Command("Lab", "emulate", "emulate a serial device until interrupted", _emulate, _emulate_arguments),
     Command("Lab", "latency", "measure latency in virtual time and judge it", _latency, _latency_arguments),
     Command("Lab", "latency-accept", "measure, and make that the accepted latency", _latency_accept,

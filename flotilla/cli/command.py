@@ -25,6 +25,8 @@ class Command:
     arguments: Callable[[argparse.ArgumentParser], None] = no_arguments
     packages: Literal["build", "station"] = "build"
     """The group of requirements/ that has the Python packages which both functions import."""
+    root: bool = False
+    """Whether it needs root, so that it may run through sudo; the Makefile names the same commands."""
 
 
 def robot_argument(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from importlib.metadata import entry_points
 from itertools import groupby
 
 from flotilla.cli.command import Command
-from flotilla.common import paths
+from flotilla.common import paths, sudo
 from flotilla.common.errors import UserError
 from flotilla.common.text import shown
 
@@ -66,9 +66,22 @@ def main() -> int:
     try:
         arguments = parser(known, lambda command: word in (command.name, "completion")).parse_args()
         paths.check()
-        next(command for command in known if command.name == arguments.command).run(arguments)
+        command = next(command for command in known if command.name == arguments.command)
+        caller = sudo.caller()
+        if caller and not command.root:
+            raise sudo.refusal(f"flotilla {command.name}")
+        try:
+            command.run(arguments)
+        finally:
+            if caller:
+                sudo.hand_back(caller)
     except UserError as error:
         print(f"error: {shown(str(error))}", file=sys.stderr)
+        return 1
+    except PermissionError as error:
+        if not (explained := sudo.left_by_root(error)):
+            raise
+        print(f"error: {shown(str(explained))}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
         group = next(command.packages for command in known if command.name == word)

@@ -7,8 +7,11 @@ it: when the builder dies, however it dies, the kernel ends the stage and takes 
 from __future__ import annotations
 
 import os
+import pwd
 import re
+import shutil
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -56,34 +59,95 @@ def _check_capabilities() -> None:
         )
 
 
+_PROC = Path("/proc")
+_ETC = Path("/etc")
+_CONTAINERS = (Path("/.dockerenv"), Path("/run/.containerenv"), Path("/run/systemd/container"))
+"""Files that container managers make: Docker, Podman, systemd-nspawn and LXC."""
+_SETTINGS = {
+    "kernel.unprivileged_userns_clone": ("0", "1"),
+    "user.max_user_namespaces": ("0", "10000"),
+    "kernel.apparmor_restrict_unprivileged_userns": ("1", "0"),
+}
+"""Settings of the kernel: the value that forbids user namespaces, and one that allows them."""
+_USERS = 65536
+"""Users that a stage of an ordinary user maps."""
+
+
+def cause(stderr: str, *, user: bool | None = None) -> str:
+    """Why this computer refuses a namespace, with the remedy; empty where the cause is none of the known ones.
+
+    `stderr`: what the refused program wrote. `user`: whether root asked for a user namespace, too.
+    """
+    root = os.geteuid() == 0
+    contained = any(file.exists() for file in _CONTAINERS)
+    for setting, (forbidding, allowing) in _SETTINGS.items():
+        file = _PROC / "sys" / setting.replace(".", "/")
+        applies = not root or (user and setting == "user.max_user_namespaces")
+        if applies and file.exists() and file.read_text().strip() == forbidding:
+            where = "on the computer that runs this container, " if contained else ""
+            kept = "/etc/sysctl.d/60-flotilla.conf"
+            return (
+                f"{file}: {forbidding}: this computer forbids user namespaces, which building needs; {where}"
+                f"allow them with `echo {setting}={allowing} | sudo tee -a {kept} && sudo sysctl -p {kept}`"
+            )
+    mapping = not root and any(word in stderr for word in ("subuid", "subgid", "newuidmap", "newgidmap", "id_map"))
+    if mapping and (fault := _missing_range() or _powerless_newuidmap()):
+        return fault
+    if not (_PROC / "self/ns/user").exists():
+        return "this kernel has no user namespaces (CONFIG_USER_NS); build on a computer whose kernel has them"
+    if contained:
+        return (
+            "this container refuses them; start it with `docker run --security-opt seccomp=unconfined --security-opt "
+            "apparmor=unconfined --security-opt systempaths=unconfined …`, or with these options of podman"
+        )
+    return ""
+
+
+def _missing_range() -> str:
+    number = str(os.geteuid())
+    name = next((account.pw_name for account in pwd.getpwall() if str(account.pw_uid) == number), number)
+    files = [_ETC / "subuid", _ETC / "subgid"]
+    ranges = [
+        [(who, int(first), int(count)) for who, first, count in re.findall(r"(?m)^([^:\n]+):(\d+):(\d+)$", text)]
+        for text in (file.read_text() if file.exists() else "" for file in files)
+    ]
+    # unshare(1) takes the first one.
+    lacking = [
+        str(file)
+        for file, found in zip(files, ranges, strict=True)
+        if next((count for who, _, count in found if who in (name, number)), 0) < _USERS
+    ]
+    if not lacking:
+        return ""
+    free = max([100000, *(first + count for found in ranges for _, first, count in found)])
+    span = f"{free}-{free + _USERS - 1}"
+    return (
+        f"{', '.join(lacking)}: no range of {_USERS} for {name}, whom building without root gives as many users; "
+        f"add one with `sudo usermod --add-subuids {span} --add-subgids {span} {name}`"
+    )
+
+
+def _powerless_newuidmap() -> str:
+    """Why it cannot map users though there is a range."""
+    if re.search(r"^NoNewPrivs:\s*1$", (_PROC / "self/status").read_text(), re.MULTILINE):
+        return (
+            "no program may gain privileges here (no_new_privs), so newuidmap maps no users; build outside of the "
+            "sandbox that this shell is in, or start the container without `--security-opt no-new-privileges`"
+        )
+    for program in ("newuidmap", "newgidmap"):
+        file = Path(shutil.which(program) or f"/usr/bin/{program}")
+        capable = file.exists() and (file.stat().st_mode & stat.S_ISUID or "security.capability" in os.listxattr(file))
+        if not capable:
+            return (
+                f"{file}: has neither the set-user-ID bit nor capabilities, so it maps no users; "
+                "`sudo apt-get install --reinstall uidmap` restores it"
+            )
+    return ""
+
+
 def _refusal(stderr: str) -> UserError:
     """What a host that forbids namespaces means for its user."""
-    reasons = [
-        (Path("/proc/sys/kernel/unprivileged_userns_clone"), "0", "sudo sysctl kernel.unprivileged_userns_clone=1"),
-        (Path("/proc/sys/user/max_user_namespaces"), "0", "sudo sysctl user.max_user_namespaces=10000"),
-        (
-            Path("/proc/sys/kernel/apparmor_restrict_unprivileged_userns"),
-            "1",
-            "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0",
-        ),
-    ]
-    for setting, forbidding, remedy in reasons:
-        if os.geteuid() != 0 and setting.exists() and setting.read_text().strip() == forbidding:
-            return UserError(
-                f"{setting}: {forbidding}: this computer forbids user namespaces, which building without root needs; "
-                f"allow them with `{remedy}`, or build as root with `sudo make image …`"
-            )
-    if os.geteuid() != 0 and ("subuid" in stderr or "newuidmap" in stderr or "uid_map" in stderr):
-        return UserError(
-            f"/etc/subuid: no range for {os.environ.get('USER', os.getuid())}: building without root maps 65536 users; "
-            "add one with `sudo usermod --add-subuids 100000-165535 --add-subgids 100000-165535 $USER`, "
-            "or build as root with `sudo make image …`"
-        )
-    remedy = (
-        "build on a computer, or in a container, that allows one"
-        if os.geteuid() == 0
-        else ("build as root with `sudo make image …`")
-    )
+    remedy = cause(stderr) or "build on a computer, or in a virtual machine or container, that allows one"
     return UserError(f"this computer refuses a mount namespace: {stderr.strip()}; {remedy}")
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from flotilla.common import namespace
 from flotilla.common.errors import UserError
 
 SECONDS = 1800
@@ -55,8 +56,10 @@ def command(
 def refusal(stderr: str) -> UserError | None:
     """Why there is no sandbox, where bubblewrap or its absence says so."""
     if line := next((line for line in stderr.splitlines() if line.startswith(("bwrap: ", "prlimit: "))), ""):
+        remedy = namespace.cause(line, user=True)
+        if line.startswith("prlimit: "):
+            remedy = "install it: sudo apt-get install --no-install-recommends bubblewrap"
         return UserError(
-            f"{line}: nothing that others wrote is built or checked without a sandbox: install bubblewrap, and allow "
-            "namespaces"
+            f"{line}: nothing that others wrote is built or checked without a sandbox" + f"; {remedy}" * bool(remedy)
         )
     return None

@@ -99,7 +99,7 @@ class Tree:
 def make(suite: str, layer: Path) -> Tree:
     """The tree of a release of Debian, from the cache where it was made before, below an empty `layer`."""
     if os.geteuid() != 0:
-        raise UserError("trees of other hosts need root, for overlays and device nodes; run the same with `sudo`")
+        raise UserError("trees of other hosts need root, for overlays and device nodes; be root of a container")
 
     def bootstrap(out: Path) -> None:
         mirrors = mirror.resolve()

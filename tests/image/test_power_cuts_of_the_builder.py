@@ -105,7 +105,7 @@ class Disk:
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Disk]:
     if os.geteuid() != 0:
-        pytest.fail("mounts disks: run it as root, `sudo make test-all`", pytrace=False)
+        pytest.fail("mounts disks: run it in a container or a virtual machine where you are root", pytrace=False)
     directory = tmp_path.resolve()
     argv = ["setpriv", "--pdeathsig", "KILL", "unshare", "--mount", "cat"]
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flotilla.common import namespace
+from flotilla.common import namespace, sandbox
 from flotilla.common.errors import UserError
 
 
@@ -84,35 +85,131 @@ def test_a_refused_user_namespace_is_said_and_nothing_stays_behind(tmp_path: Pat
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "/proc/sys/user/max_user_namespaces: 0: this computer forbids user namespaces" in done.stdout
+    assert "user.max_user_namespaces=10000 | sudo tee" in done.stdout
     assert done.stdout.splitlines()[-1] == f"-{signal.SIGKILL.value}"
 
 
-@pytest.mark.parametrize(
-    "stderr",
-    [
-        "unshare: write failed /proc/self/uid_map: Operation not permitted",
-        "unshare: cannot change root filesystem propagation: Permission denied",
-        "mount: /mnt: permission denied.\n       dmesg(1) may have more information after failed mount system call.",
-    ],
-)
-def test_a_forbidden_user_namespace_names_the_setting(monkeypatch: pytest.MonkeyPatch, stderr: str) -> None:
-    """Of Ubuntu 24.04's AppArmor, which lets a namespace be made and then takes its privileges."""
+@pytest.fixture
+def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A computer of an ordinary user that forbids nothing: its /proc, /etc, newuidmap and marks of containers."""
+    for name, text in {
+        "proc/self/ns/user": "",
+        "proc/self/status": "NoNewPrivs:\t0\n",
+        "etc/subuid": "bob:100000:65536\n1000:165536:65536\n",
+        "etc/subgid": "bob:100000:65536\n1000:165536:65536\n",
+        "bin/newuidmap": "",
+        "bin/newgidmap": "",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    for name in ("newuidmap", "newgidmap"):
+        (tmp_path / "bin" / name).chmod(0o4755)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    real = Path.read_text
-    monkeypatch.setattr(Path, "exists", lambda path: "apparmor_restrict" in str(path))
-    monkeypatch.setattr(Path, "read_text", lambda path, *rest: "1\n" if "apparmor" in str(path) else real(path, *rest))
+    monkeypatch.setattr(pwd, "getpwall", list)
+    monkeypatch.setattr(namespace, "_PROC", tmp_path / "proc")
+    monkeypatch.setattr(namespace, "_ETC", tmp_path / "etc")
+    monkeypatch.setattr(namespace, "_CONTAINERS", (tmp_path / ".dockerenv",))
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    return tmp_path
+
+
+DENIED = "unshare: write failed /proc/self/uid_map: Operation not permitted"
+NO_RANGE = "newuidmap: uid range [1-65536) -> [100000-165535) not allowed"
+_CAUSES: dict[str, tuple[str, dict[str, str | None], list[str]]] = {
+    "switched off by Debian's setting": (
+        "unshare: unshare failed: Operation not permitted",
+        {"proc/sys/kernel/unprivileged_userns_clone": "0\n"},
+        ["unprivileged_userns_clone: 0: this computer forbids user namespaces",
+         "`echo kernel.unprivileged_userns_clone=1 | sudo tee -a /etc/sysctl.d/60-flotilla.conf && sudo sysctl -p "],
+    ),
+    "switched off in a container": (
+        "unshare: unshare failed: No space left on device",
+        {"proc/sys/user/max_user_namespaces": "0\n", ".dockerenv": ""},
+        ["max_user_namespaces: 0: this computer forbids user namespaces",
+         "on the computer that runs this container, allow them with `echo user.max_user_namespaces=10000 | "],
+    ),
+    # Of Ubuntu 24.04's AppArmor, which lets a namespace be made and then takes its privileges.
+    **{
+        f"restricted by AppArmor, {n}": (
+            stderr,
+            {"proc/sys/kernel/apparmor_restrict_unprivileged_userns": "1\n"},
+            ["apparmor_restrict_unprivileged_userns: 1: this computer forbids user namespaces",
+             "`echo kernel.apparmor_restrict_unprivileged_userns=0 | sudo tee "],
+        )
+        for n, stderr in enumerate([
+            DENIED,
+            "unshare: cannot change root filesystem propagation: Permission denied",
+            "mount: /mnt: permission denied.\n       dmesg(1) may have more information after failed system call.",
+        ])
+    },
+    "no range": (
+        NO_RANGE,
+        {"etc/subuid": "bob:100000:65536\n", "etc/subgid": "bob:100000:65536\n"},
+        ["etc/subuid, ", "etc/subgid: no range of 65536 for 1000",
+         "`sudo usermod --add-subuids 165536-231071 --add-subgids 165536-231071 1000`"],
+    ),
+    "no range of groups": (
+        "newgidmap: gid range [1-65536) -> [100000-165535) not allowed",
+        {"etc/subgid": ""},
+        ["etc/subgid: no range of 65536", "--add-subgids 231072-296607 1000`"],
+    ),
+    "a short range": (NO_RANGE, {"etc/subuid": "1000:100000:1000\n"}, ["etc/subuid: no range of 65536 for 1000"]),
+    "no files of ranges": (
+        "unshare: no line matching user \"ada\" in /etc/subuid",
+        {"etc/subuid": None, "etc/subgid": None},
+        ["no range of 65536", "--add-subuids 100000-165535 "],
+    ),
+    "no new privileges": (
+        "newuidmap: write to uid_map failed: Operation not permitted",
+        {"proc/self/status": "NoNewPrivs:\t1\n"},
+        ["no program may gain privileges here (no_new_privs)", "`--security-opt no-new-privileges`"],
+    ),
+    "newuidmap without privilege": (
+        "newuidmap: write to uid_map failed: Operation not permitted",
+        {"bin/newuidmap": "no privileges"},
+        ["newuidmap: has neither the set-user-ID bit nor capabilities", "`sudo apt-get install --reinstall uidmap`"],
+    ),
+    "a kernel without": (
+        "unshare: unshare failed: Invalid argument",
+        {"proc/self/ns/user": None},
+        ["this kernel has no user namespaces (CONFIG_USER_NS)"],
+    ),
+    "a container": (
+        "unshare: unshare failed: Operation not permitted",
+        {".dockerenv": ""},
+        ["this container refuses them; start it with `docker run --security-opt seccomp=unconfined "],
+    ),
+    "unknown": ("unshare: unshare failed: Operation not permitted", {}, ["build on a computer, or in a virtual "]),
+}  # fmt: skip
+"""By what forbids namespaces: what a program writes then, files of the computer, and parts of the message."""
+
+
+@pytest.mark.parametrize("case", _CAUSES)
+def test_a_refused_namespace_has_the_remedy_of_its_cause(host: Path, case: str) -> None:
+    """Seen to fail: each message offered to build as root through sudo, for half of the causes it had nothing else, and
+    the range was one that others had."""
+    stderr, files, parts = _CAUSES[case]
+    for name, text in files.items():
+        (host / name).parent.mkdir(parents=True, exist_ok=True)
+        (host / name).unlink() if text is None else (host / name).write_text(text)
+        if name.startswith("bin/"):
+            (host / name).chmod(0o755)
     message = str(namespace._refusal(stderr))
-    assert "apparmor_restrict_unprivileged_userns: 1: this computer forbids user namespaces" in message
-    assert "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0" in message
-    assert "sudo make image" in message
+    assert message.startswith(f"this computer refuses a mount namespace: {stderr.strip()}; ")
+    assert [part for part in parts if part not in message] == [], message
+    assert "as root" not in message
 
 
-def test_a_user_without_a_range_is_told_how_to_get_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    monkeypatch.setenv("USER", "ada")
-    message = str(namespace._refusal("newuidmap: uid range [1-65536) -> [100000-165535) not allowed"))
-    assert message.startswith("/etc/subuid: no range for ada")
-    assert "--add-subuids" in message
+def test_a_refused_sandbox_has_the_same_remedies(host: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen to fail: it was to install bubblewrap, which was there. Root's sandbox has a user namespace, too."""
+    (host / "proc/sys/user").mkdir(parents=True)
+    (host / "proc/sys/user/max_user_namespaces").write_text("0\n")
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    said = sandbox.refusal("bwrap: Creating new namespace failed: No space left on device\n")
+    assert "sudo tee -a /etc/sysctl.d/60-flotilla.conf" in str(said)
+    assert "apt-get install --no-install-recommends bubblewrap" in str(
+        sandbox.refusal("prlimit: failed to execute bwrap: No such file or directory\n")
+    )
 
 
 def test_errors_are_shown_though_many_warnings_follow() -> None:
