@@ -323,9 +323,10 @@ class Board(_Model):
     """Kernel name of the wired port. It has the robot's address when `network.link` is `ethernet`. Images boot with
     `net.ifnames=0`, so the first one is `eth0` on every board."""
     packets_per_s: Annotated[Integer, between(100, 10_000_000)] = 4000
-    """Packets of TCP that the firewall lets in, a second; of all else half as many by one network interface, and a
-    quarter as many from one address. More are dropped where they cost least. With a lower number control keeps its
-    deadlines in a worse flood; with a higher one files arrive faster."""
+    """Packets of TCP a second that the firewall lets in by one network interface, and three quarters of that from one
+    address; of all else half as many by one interface, and a quarter as many from one address; a quarter from outside
+    the fleet's subnet. More are dropped where they cost least. With a lower number control keeps its deadlines in a
+    worse flood; with a higher one files arrive faster."""
     disk_modules: list[Module]
     """Kernel modules that reach the card. The initramfs consists of them."""
     modules: list[Module] = []

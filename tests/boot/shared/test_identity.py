@@ -52,6 +52,21 @@ def test_host_key_is_the_pinned_one(robot: RobotGuest, tmp_path: Path) -> None:
     assert _ssh(robot, "echo in").stdout == "in\n"
 
 
+_KNOCK = """
+import socket
+knocks = [socket.create_connection(("127.0.0.1", 22)) for _ in range(7)]
+print([knock.recv(100).startswith(b"SSH-2.0-") for knock in knocks])
+"""
+
+
+def test_connections_without_a_login_are_few(robot: RobotGuest) -> None:
+    """From one address; others get in meanwhile."""
+    greeted = sh(robot, f"python3 - <<'END'\n{_KNOCK}END")
+    assert greeted == str([True] * 5 + [False] * 2)
+    settings = sh(robot, "sshd -T").splitlines()
+    assert {"logingracetime 30", "maxstartups 20:30:60", "persourcemaxstartups 5"} <= {*settings}
+
+
 @pytest.fixture
 def stranger(tmp_path: Path) -> Path:
     """The private key of somebody whom nobody has admitted yet."""
