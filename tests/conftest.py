@@ -168,9 +168,11 @@ def _boot(
     segment: Segment | None = None,
     qemu_options: dict[str, Any] | None = None,
     image: Path | None = None,
+    of: Fleet | None = None,
     label: str = "",
     **arguments: Any,
 ) -> RobotGuest:
+    fleet = of or fleet
     robot = inventory.robot(fleet, number)
     board = fleet.boards[robot.board]
     if kernel and kernel != board.kernel:

@@ -17,6 +17,8 @@ from flotilla.fleet.model import Fleet
 from images.builder import kernel, lock, manifest, rootfs
 from images.builder.lock import board_lock, read_lock
 
+NEW = "pc_uefi"
+"""The board of a new home's robot."""
 BOARD = "x86_64"
 
 
@@ -50,7 +52,7 @@ def test_a_new_home_is_a_fleet(fleet_home: Path, inside: str) -> None:
     done = flotilla("check-fleet", where=fleet_home / inside)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[0] == "rover-lab-2: 1 robot, 1 station, 10.42.0.0/24 over ethernet"
-    assert done.stdout.splitlines()[1].split()[:3] == ["1", "robot1", BOARD]
+    assert done.stdout.splitlines()[1].split()[:3] == ["1", "robot1", NEW]
 
 
 def test_the_variable_counts_more_than_the_place(fleet_home: Path) -> None:
@@ -165,7 +167,7 @@ def test_a_board_of_the_home(fleet_home: Path) -> None:
     described = yaml.safe_load((paths.BOARDS / f"group_vars/board_{BOARD}.yml").read_text())
     (fleet_home / "inventory/group_vars/board_rover.yml").write_text(yaml.safe_dump(described))
     robots = fleet_home / "inventory/robots.yml"
-    robots.write_text(robots.read_text().replace("board_x86_64:", "board_rover:"))
+    robots.write_text(robots.read_text().replace(f"board_{NEW}:", "board_rover:"))
     done = flotilla("check-fleet", where=fleet_home)
     assert done.returncode == 1
     assert f"has no package list {fleet_home}/packages/rover.list" in done.stderr
@@ -177,9 +179,9 @@ def test_a_board_of_the_home(fleet_home: Path) -> None:
 
 
 def test_values_of_the_home_win_over_the_tools(fleet_home: Path) -> None:
-    described = yaml.safe_load((paths.BOARDS / f"group_vars/board_{BOARD}.yml").read_text())
+    described = yaml.safe_load((paths.BOARDS / f"group_vars/board_{NEW}.yml").read_text())
     described["board"]["suite"] = "sid"
-    file = fleet_home / f"inventory/group_vars/board_{BOARD}.yml"
+    file = fleet_home / f"inventory/group_vars/board_{NEW}.yml"
     file.write_text(yaml.safe_dump(described))
     done = flotilla("check-fleet", where=fleet_home)
     assert done.returncode == 1
