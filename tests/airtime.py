@@ -15,7 +15,7 @@ from flotilla.updates import multicast
 from lab.qemu.radio import Radio
 from lab.qemu.timing import Deadline
 
-_SYMBOL_BYTES = multicast.HEADERS + 8 + multicast.SYMBOL
+_SYMBOL_BYTES = multicast.HEADERS + multicast.OVERHEAD + multicast.SYMBOL
 """Of a frame that has a symbol, which no other frame of a station has."""
 
 

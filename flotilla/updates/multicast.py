@@ -7,9 +7,11 @@ its number: it replaces whichever symbol a robot lost, so all robots are served 
 
 Neither end needs what an earlier call knew: robots say what they lack, so a sender that starts again continues.
 
-Datagrams, all numbers big-endian:
+A transfer has a key of its own, which comes to robots by SSH. A datagram begins with a tag, the first 8 bytes of
+HMAC-SHA-256 by that key over the transfer's number (32 bit) and all that follows the tag; that of an answer is of the
+robot's address, too. Then come, all numbers big-endian:
 
-| first 8 bytes: transfer (32 bit), block, symbol (16 bit each) | then |
+| 4 bytes: block, symbol (16 bit each) | then |
 |---|---|
 | a block's number, a symbol's number | 512 bytes; from 2048 on it is a repair symbol |
 | 0xffff, number of the question | addresses of the robots that shall answer, in this order, 20 ms apart |
@@ -20,6 +22,7 @@ Datagrams, all numbers big-endian:
 from __future__ import annotations
 
 import argparse
+import hmac
 import json
 import math
 import random
@@ -51,7 +54,13 @@ RATE = 300_000
 HEADERS = 14 + 20 + 8
 """Bytes of Ethernet, IPv4 and UDP."""
 
-_HEADER = struct.Struct("!LHH")
+TAG = 8
+"""Bytes."""
+KEY_BYTES = 32
+
+_HEADER = struct.Struct("!HH")
+OVERHEAD = TAG + _HEADER.size
+"""Bytes of a datagram before a symbol."""
 _ANSWER = struct.Struct("!LH")
 _NEED = struct.Struct("!HH")
 _QUESTION, _ANSWERED, _END = 0xFFFF, 0xFFFE, 0xFFFD
@@ -88,8 +97,13 @@ def describe(content: bytes) -> str:
     )
 
 
+def order(key: bytes, description: str) -> str:
+    """What `receive begin` reads on a robot."""
+    return f"key {key.hex()}\n{description}"
+
+
 def transfer_number(content: bytes) -> int:
-    """By it robots tell this file's datagrams from others'."""
+    """It is part of what the tags are of."""
     return zlib.crc32(content)
 
 
@@ -129,19 +143,37 @@ class Block:
         return total.to_bytes(SYMBOL, "little")
 
 
-def symbol(transfer: int, number: int, which: int, block: Block) -> bytes:
-    """The datagram with symbol `which` of the transfer's block `number`."""
-    return _HEADER.pack(transfer, number, which) + block.symbol(which)
+@dataclass(frozen=True)
+class Transfer:
+    """A file's number, and the key by which its datagrams are authenticated."""
 
+    number: int
+    key: bytes
 
-def question(transfer: int, number: int, robots: Sequence[str]) -> bytes:
-    """The datagram that asks robots, by their addresses, what they lack."""
-    return _HEADER.pack(transfer, _QUESTION, number) + b"".join(IPv4Address(address).packed for address in robots)
+    def symbol(self, number: int, which: int, block: Block) -> bytes:
+        """The datagram with symbol `which` of block `number`."""
+        return self._tagged(_HEADER.pack(number, which) + block.symbol(which))
 
+    def question(self, number: int, robots: Sequence[str]) -> bytes:
+        """The datagram that asks robots, by their addresses, what they lack."""
+        return self._tagged(
+            _HEADER.pack(_QUESTION, number) + b"".join(IPv4Address(address).packed for address in robots)
+        )
 
-def end(transfer: int) -> bytes:
-    """The datagram after which nothing comes any more."""
-    return _HEADER.pack(transfer, _END, 0)
+    def end(self) -> bytes:
+        """The datagram after which nothing comes any more."""
+        return self._tagged(_HEADER.pack(_END, 0))
+
+    def answer(self, datagram: bytes, address: str) -> bytes | None:
+        """What follows the tag, where it is of the robot with this address."""
+        tag, content = datagram[:TAG], datagram[TAG:]
+        return content if hmac.compare_digest(tag, self._tag(content + IPv4Address(address).packed)) else None
+
+    def _tagged(self, content: bytes) -> bytes:
+        return self._tag(content) + content
+
+    def _tag(self, content: bytes) -> bytes:
+        return hmac.digest(self.key, self.number.to_bytes(4, "big") + content, "sha256")[:TAG]
 
 
 @dataclass
@@ -197,14 +229,14 @@ class Sender:
     """Sends one file. One thread; `run` returns when all robots have the file, or cannot be brought to."""
 
     def __init__(
-        self, content: bytes, source: IPv4Address, robots: Sequence[IPv4Address], *, rate: int = RATE,
+        self, content: bytes, source: IPv4Address, robots: Sequence[IPv4Address], key: bytes, *, rate: int = RATE,
         group: IPv4Address = GROUP, port: int = PORT,
     ) -> None:  # fmt: skip
         """`content` is not empty; `rate` is in bits a second, headers included; `source` is this station's address."""
         self._content = content
         self._rate = rate
         self._to = str(group), port
-        self._transfer = transfer_number(content)
+        self._transfer = Transfer(transfer_number(content), key)
         self._count = math.ceil(len(content) / (BLOCK * SYMBOL))
         unknown = {block: self._symbols(block) for block in range(self._count)}
         self._robots = {str(address): _Robot(dict(unknown)) for address in robots}
@@ -262,7 +294,7 @@ class Sender:
                     told = time.monotonic()
                     watch(self._report(told - began))
             for _ in range(3):  # a robot that hears none of them ends by itself
-                self._send(end(self._transfer))
+                self._send(self._transfer.end())
         return self._report(time.monotonic() - began)
 
     def _report(self, seconds: float) -> Report:
@@ -305,7 +337,7 @@ class Sender:
             return False
         job = self._jobs[0]
         number = job.numbers.popleft()
-        self._send(symbol(self._transfer, job.block, number, self._block(job.block)))
+        self._send(self._transfer.symbol(job.block, number, self._block(job.block)))
         self._symbols_sent += 1
         if not job.numbers:
             self._jobs.popleft()
@@ -335,7 +367,7 @@ class Sender:
             self._robots[address].answered = False
         self._question = self._question % 0xFFFF + 1
         self._sent_since.clear()
-        self._send(question(self._transfer, self._question, asked[: SYMBOL // 4]))
+        self._send(self._transfer.question(self._question, asked[: SYMBOL // 4]))
         self._asked_at, self._wait_s = time.monotonic(), len(asked) * _SLOT_S + _PATIENCE_S
 
     def _left_s(self) -> float:
@@ -360,15 +392,15 @@ class Sender:
     def _take(self, address: str, datagram: bytes) -> None:
         robot = self._robots.get(address)
         start = _HEADER.size + _ANSWER.size
-        if robot is None or len(datagram) < start:
+        content = self._transfer.answer(datagram, address) if robot else None
+        if robot is None or content is None or len(content) < start:
             return
-        transfer, kind, question = _HEADER.unpack_from(datagram)
-        arrived, count = _ANSWER.unpack_from(datagram, _HEADER.size)
-        if (transfer, kind, question) != (self._transfer, _ANSWERED, self._question):
+        arrived, count = _ANSWER.unpack_from(content, _HEADER.size)
+        if _HEADER.unpack_from(content) != (_ANSWERED, self._question):
             return
-        if len(datagram) != start + count * _NEED.size:
+        if len(content) != start + count * _NEED.size:
             return
-        needs = dict(_NEED.iter_unpack(datagram[start:]))
+        needs = dict(_NEED.iter_unpack(content[start:]))
         if count == _MOST_NEEDS:  # of blocks after those nothing is said
             last = max(needs)
             needs |= {block: need for block, need in robot.needs.items() if block > last}
@@ -405,14 +437,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Send a file to robots that run flotilla-receive.")
     parser.add_argument("--describe", action="store_true", help="print what flotilla-receive must know, and end")
     parser.add_argument("--at", type=IPv4Address, help="this station's address")
+    parser.add_argument("--key", type=Path, metavar="FILE", help="the transfer's key, 64 hexadecimal digits")
     parser.add_argument("--rate", type=int, default=RATE, metavar="BIT/S", help=f"headers included ({RATE})")
     parser.add_argument("--group", type=IPv4Address, default=GROUP, help=f"multicast group ({GROUP})")
     parser.add_argument("--port", type=int, default=PORT, help=f"UDP port ({PORT})")
     parser.add_argument("file", type=Path)
     parser.add_argument("robots", type=IPv4Address, nargs="*", metavar="ADDRESS", help="of robots")
     arguments = parser.parse_args()
-    if not arguments.describe and not (arguments.at and arguments.robots):
-        parser.error("the following arguments are required: --at, and addresses of robots")
+    if not arguments.describe and not (arguments.at and arguments.key and arguments.robots):
+        parser.error("the following arguments are required: --at, --key, and addresses of robots")
     if arguments.rate < 1:
         parser.error(f"--rate: {arguments.rate}: give bits a second, 1 or more")
     content = arguments.file.read_bytes()
@@ -421,8 +454,14 @@ def main() -> None:
     if arguments.describe:
         print(describe(content), end="")
         return
+    try:
+        key = bytes.fromhex(arguments.key.read_text())
+    except ValueError:
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise UserError(f"{arguments.key}: is no key: give {2 * KEY_BYTES} hexadecimal digits")
     sender = Sender(
-        content, arguments.at, arguments.robots, rate=arguments.rate, group=arguments.group, port=arguments.port
+        content, arguments.at, arguments.robots, key, rate=arguments.rate, group=arguments.group, port=arguments.port
     )
     report = sender.run()
     print(report)

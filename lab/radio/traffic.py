@@ -134,7 +134,7 @@ def describe(fleet: Fleet) -> Description:
         )
     stations = tuple(range(len(robots), len(robots) + len(fleet.stations)))
     everybody = tuple(range(len(robots)))
-    packet = UDP_BYTES + 8 + multicast.SYMBOL
+    packet = UDP_BYTES + multicast.OVERHEAD + multicast.SYMBOL
     update = Flow("update", stations[0], everybody, packet, to_all=True) if stations else None
     programs = {
         index: (sum(robot == index and _uses_dds(task) for robot, _, task in rendered), len(each.control_tasks) + 1)
@@ -143,7 +143,7 @@ def describe(fleet: Fleet) -> Description:
     return Description(
         fleet.name, tuple(robot.name for robot in robots), tuple(host.name for host in fleet.stations), tuple(tasks),
         tuple(_chains(tasks)), positions, update,
-        round((multicast.SYMBOL + 8 + multicast.HEADERS) * 8e6 / fleet.network.update_kbit_s),
+        round((multicast.SYMBOL + multicast.OVERHEAD + multicast.HEADERS) * 8e6 / fleet.network.update_kbit_s),
         programs, len(fleet.network.ibss.ssid) if fleet.network.ibss else 8,
     )  # fmt: skip
 

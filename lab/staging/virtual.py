@@ -53,6 +53,8 @@ MEMORY_MIB = 512
 """Of the guest, which has its card in memory."""
 ALONE, BAD = "alone", "bad"
 """The task without an update; the heartbeat with the library by which tasks of a bad release overrun."""
+KEY = bytes(range(multicast.KEY_BYTES))
+"""Of the transfer: what is measured repeats."""
 SHIPPED, RECEIVER, UPDATER = "shipped", "receiver", "updater"
 ABOVE = 90
 """A real-time priority; the task has 80."""
@@ -107,7 +109,7 @@ def update(board: Board, directory: Path) -> Update:
     files = {f"{DIRECTORY}/card/{at}": piece for at, piece in pieces.items()}
     own = {
         "offer": release.Bundle(made, manifest, (signature(directory, manifest),), 0).offer,
-        "description": multicast.describe(sent).encode(),
+        "description": multicast.order(KEY, multicast.describe(sent)).encode(),
         "tape": symbols,
         "sender": (HERE / "sender.py").read_bytes(),
     }
@@ -161,7 +163,7 @@ def tape(content: bytes) -> tuple[bytes, int]:
     """
     if len(content) > multicast.BLOCK * multicast.SYMBOL:
         raise UserError(f"a delta of {len(content)} bytes: more than a block, which is what a tape has")
-    transfer = multicast.transfer_number(content)
+    transfer = multicast.Transfer(multicast.transfer_number(content), KEY)
     block = multicast.Block(content)
     chance = random.Random(SEED)
     out, lost = [], 0
@@ -169,20 +171,20 @@ def tape(content: bytes) -> tuple[bytes, int]:
     def send(datagram: bytes, *, arrives: bool = True) -> None:
         out.append(struct.pack("!H", len(datagram) | (0 if arrives else 0x8000)) + datagram)
 
-    send(multicast.question(transfer, 1, [ROBOT]))
+    send(transfer.question(1, [ROBOT]))
     for number in range(-(-len(content) // multicast.SYMBOL)):
         arrives = chance.random() >= LOSS
         lost += not arrives
-        send(multicast.symbol(transfer, 0, number, block), arrives=arrives)
-    send(multicast.question(transfer, 2, [ROBOT]))
+        send(transfer.symbol(0, number, block), arrives=arrives)
+    send(transfer.question(2, [ROBOT]))
     left, number = lost + MORE_REPAIRS, multicast.BLOCK
     while left:
         arrives = chance.random() >= LOSS
         left -= arrives
-        send(multicast.symbol(transfer, 0, number, block), arrives=arrives)
+        send(transfer.symbol(0, number, block), arrives=arrives)
         number += 1
-    send(multicast.question(transfer, 3, [ROBOT]))
-    send(multicast.end(transfer))
+    send(transfer.question(3, [ROBOT]))
+    send(transfer.end())
     return b"".join(out), lost
 
 

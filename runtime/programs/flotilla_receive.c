@@ -12,6 +12,9 @@
 #include <getopt.h>
 #include <inttypes.h>
 #include <limits.h>
+#include <nettle/base16.h>
+#include <nettle/hmac.h>
+#include <nettle/memops.h>
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -21,11 +24,12 @@
 #include <unistd.h>
 
 static const char usage[] =
-    "usage: flotilla-receive [OPTION]... --from ADDRESS --at ADDRESS DESCRIPTION FILE\n"
+    "usage: flotilla-receive [OPTION]... --from ADDRESS --at ADDRESS --key KEY DESCRIPTION FILE\n"
     "Receive FILE, which a station sends to all robots at once. DESCRIPTION is what the station says of it.\n"
     "\n"
     "  --from ADDRESS   the station; datagrams of others are ignored\n"
     "  --at ADDRESS     this robot's address: by it the station asks, and it names the interface\n"
+    "  --key KEY        file with the key of this transfer, 64 hexadecimal digits: by it datagrams are authenticated\n"
     "  --group ADDRESS  multicast group (default: 239.255.42.42)\n"
     "  --port PORT      UDP port (default: 4242)\n"
     "  --idle SECONDS   give up after so long without a datagram (default: 600)\n"
@@ -34,20 +38,27 @@ static const char usage[] =
     "A call with the same FILE continues. FILE exists when it is whole: then the call prints `whole`, and still "
     "answers\n"
     "the station until that ends, or sends nothing more.\n"
-    "Status: 0 FILE is whole, 1 an error of the system, 2 the command line or DESCRIPTION is wrong, 3 FILE is "
+    "Status: 0 FILE is whole, 1 an error of the system, 2 the command line, KEY or DESCRIPTION is wrong, 3 FILE is "
     "incomplete.\n";
 
-enum { FROM = 1, AT, GROUP, PORT, IDLE, HELP, VERSION };
+enum { FROM = 1, AT, KEY, GROUP, PORT, IDLE, HELP, VERSION };
 
 static const struct option options[] = {
-    {"from", required_argument, NULL, FROM},   {"at", required_argument, NULL, AT},
-    {"group", required_argument, NULL, GROUP}, {"port", required_argument, NULL, PORT},
-    {"idle", required_argument, NULL, IDLE},   {"help", no_argument, NULL, HELP},
-    {"version", no_argument, NULL, VERSION},   {0},
+    {"from", required_argument, NULL, FROM},
+    {"at", required_argument, NULL, AT},
+    {"key", required_argument, NULL, KEY},
+    {"group", required_argument, NULL, GROUP},
+    {"port", required_argument, NULL, PORT},
+    {"idle", required_argument, NULL, IDLE},
+    {"help", no_argument, NULL, HELP},
+    {"version", no_argument, NULL, VERSION},
+    {0},
 };
 
 enum {
-    HEADER = 8,          /* transfer (32 bit), block, symbol (16 bit each), all big-endian */
+    TAG = 8,          /* of HMAC-SHA-256 over the transfer's number (32 bit) and all that follows the tag */
+    HEADER = TAG + 4, /* tag; block, symbol (16 bit each); all numbers are big-endian */
+    KEY_BYTES = 32,
     END = 0xfffd,        /* instead of a block's number: the station ends */
     ANSWER = 0xfffe,     /* what a robot lacks */
     QUESTION = 0xffff,   /* what do you lack? */
@@ -342,7 +353,7 @@ static bool take_symbol(struct transfer *transfer, unsigned number, uint16_t sym
     return try_block(transfer, number);
 }
 
-/* --- questions --- */
+/* --- datagrams --- */
 
 static void put16(uint8_t *to, unsigned value)
 {
@@ -361,9 +372,40 @@ static unsigned get16(const uint8_t *from)
     return (unsigned)from[0] << 8 | from[1];
 }
 
-static uint32_t get32(const uint8_t *from)
+/* The tag of a datagram; an answer's is of the address of who gives it, too. */
+static void make_tag(const struct hmac_sha256_ctx *key, const struct transfer *transfer, const uint8_t *datagram,
+                     size_t length, const struct in_addr *who, uint8_t tag[static TAG])
 {
-    return (uint32_t)get16(from) << 16 | get16(from + 2);
+    uint8_t number[4];
+    struct hmac_sha256_ctx hash = *key;
+    put32(number, transfer->number);
+    hmac_sha256_update(&hash, sizeof number, number);
+    hmac_sha256_update(&hash, length - TAG, datagram + TAG);
+    if (who)
+        hmac_sha256_update(&hash, sizeof *who, (const uint8_t *)who);
+    hmac_sha256_digest(&hash, TAG, tag);
+}
+
+/* Read KEY; false with errno. */
+static bool read_key(const char *path, struct hmac_sha256_ctx *key)
+{
+    char digits[2 * KEY_BYTES + 1] = "";
+    uint8_t bytes[BASE16_DECODE_LENGTH(2 * KEY_BYTES + 1)];
+    size_t length = sizeof bytes;
+    struct base16_decode_ctx decoder;
+    FILE *file = fopen(path, "re");
+    if (!file)
+        return false;
+    base16_decode_init(&decoder);
+    bool good = fscanf(file, "%64s", digits) == 1 &&
+                base16_decode_update(&decoder, &length, bytes, strlen(digits), digits) &&
+                base16_decode_final(&decoder) && length == KEY_BYTES;
+    fclose(file);
+    if (good)
+        hmac_sha256_set_key(key, KEY_BYTES, bytes);
+    else
+        errno = EINVAL;
+    return good;
 }
 
 /* What this robot lacks: the question's number, datagrams received (32 bit), blocks, then each one's number and how
@@ -381,9 +423,8 @@ static size_t write_answer(const struct transfer *transfer, unsigned question, u
         at += 4;
         count++;
     }
-    put32(answer, transfer->number);
-    put16(answer + 4, ANSWER);
-    put16(answer + 6, question);
+    put16(answer + TAG, ANSWER);
+    put16(answer + TAG + 2, question);
     put32(answer + HEADER, transfer->received);
     put16(answer + HEADER + 4, count);
     return at;
@@ -402,6 +443,7 @@ static int64_t now_ms(void)
 struct listener {
     int socket;
     struct in_addr from, at;
+    struct hmac_sha256_ctx key;
     int64_t idle_ms, heard_at;
     bool asked, ended;
     unsigned question;
@@ -422,13 +464,16 @@ static void take_question(struct listener *listener, unsigned question, const ui
 
 static bool take_datagram(struct listener *listener, struct transfer *transfer)
 {
-    uint8_t datagram[HEADER + 1024];
+    uint8_t datagram[HEADER + 1024], tag[TAG];
     struct sockaddr_in from = {0};
     socklen_t size = sizeof from;
     ssize_t got = recvfrom(listener->socket, datagram, sizeof datagram, 0, (struct sockaddr *)&from, &size);
-    if (got < HEADER || from.sin_addr.s_addr != listener->from.s_addr || get32(datagram) != transfer->number)
+    if (got < HEADER || from.sin_addr.s_addr != listener->from.s_addr)
         return true;
-    unsigned block = get16(datagram + 4), symbol = get16(datagram + 6);
+    make_tag(&listener->key, transfer, datagram, (size_t)got, NULL, tag);
+    if (!memeql_sec(tag, datagram, TAG))
+        return true;
+    unsigned block = get16(datagram + TAG), symbol = get16(datagram + TAG + 2);
     listener->heard_at = now_ms();
     if (block == END) {
         listener->ended = true;
@@ -445,6 +490,7 @@ static void give_answer(struct listener *listener, const struct transfer *transf
 {
     uint8_t answer[HEADER + 6 + 4 * ANSWER_BLOCKS];
     size_t length = write_answer(transfer, listener->question, answer);
+    make_tag(&listener->key, transfer, answer, length, &listener->at, answer);
     listener->asked = false;
     /* A lost answer is asked for again. */
     (void)!sendto(listener->socket, answer, length, 0, (struct sockaddr *)&listener->station, sizeof listener->station);
@@ -497,6 +543,7 @@ int main(int argc, char **argv)
 {
     struct listener listener = {.idle_ms = 600 * 1000};
     struct in_addr group = {.s_addr = htonl(0xefff2a2a)};
+    const char *key = NULL;
     long port = 4242, idle;
     for (int option, index = 0; (option = getopt_long(argc, argv, "", options, &index)) != -1;) {
         bool good = true;
@@ -506,6 +553,9 @@ int main(int argc, char **argv)
             break;
         case AT:
             good = inet_pton(AF_INET, optarg, &listener.at) == 1;
+            break;
+        case KEY:
+            key = optarg;
             break;
         case GROUP:
             good = inet_pton(AF_INET, optarg, &group) == 1 && IN_MULTICAST(ntohl(group.s_addr));
@@ -536,7 +586,7 @@ int main(int argc, char **argv)
             return 2;
         }
     }
-    if (argc - optind != 2 || !listener.from.s_addr || !listener.at.s_addr) {
+    if (argc - optind != 2 || !listener.from.s_addr || !listener.at.s_addr || !key) {
         fputs(usage, stderr);
         return 2;
     }
@@ -546,6 +596,10 @@ int main(int argc, char **argv)
         snprintf(transfer.repairs_name, PATH_MAX, "%s.repair", transfer.name) >= PATH_MAX) {
         errno = ENAMETOOLONG;
         return fail(transfer.name);
+    }
+    if (!read_key(key, &listener.key)) {
+        fail(key);
+        return 2;
     }
     if (!describe(&transfer, argv[optind])) {
         fail(argv[optind]);

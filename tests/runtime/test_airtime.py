@@ -74,8 +74,8 @@ stop|restart)
     rm -f {robot}/pid
     if [ "$1" = restart ] && [ -e {robot}/known/spool/addresses ]; then
         . {robot}/known/spool/addresses
-        setsid {programs}/flotilla-receive --from="$STATION" --at="$ROBOT" {robot}/known/spool/description \\
-            {robot}/known/spool/file </dev/null >/dev/null 2>&1 &
+        setsid {programs}/flotilla-receive --from="$STATION" --at="$ROBOT" --key={robot}/known/spool/key \\
+            {robot}/known/spool/description {robot}/known/spool/file </dev/null >/dev/null 2>&1 &
         echo $! >{robot}/pid
     fi ;;
 esac

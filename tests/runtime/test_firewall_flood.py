@@ -91,7 +91,7 @@ def _checksum(data: bytes) -> int:
     words = sum(struct.unpack(f"!{len(data) // 2}H", data))
     while words >> 16:
         words = (words & 0xFFFF) + (words >> 16)
-    return ~words & 0xFFFF
+    return int(~words & 0xFFFF)
 
 
 def syn(target_mac: bytes, source: str, target: str, number: int) -> bytes:
@@ -214,7 +214,8 @@ def main(described: dict[str, Any]) -> dict[str, Any]:
             if name not in described["by"]:
                 break
             with spaces.inside(away):
-                found[name] = each = []
+                each: list[int | str] = []
+                found[name] = each
                 while len(each) < CONNECTIONS and not any(each):
                     each.append(_connected(source, robot))
         found["dropped"] = _await_drops(_FLOODED)  # it still goes on

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ FAST = 3_000_000
 """Bits a second: what this computer carries to eight nodes with ease."""
 CONTENT = random.Random(42).randbytes(3 * 2**20 - 1000)
 """Three blocks, the last one not full."""
+KEY = random.Random(7).randbytes(multicast.KEY_BYTES)
 MEMORY = 8 << 20
 """Bytes of address space that a receiver may have, the C library's included."""
 
@@ -49,7 +51,7 @@ while True:
     if origin[2] == socket.PACKET_OUTGOING and frame[12:14] == b"\\x08\\x00":
         seconds, ns = struct.unpack("qq", extra[0][2])
         frames.append((seconds * 10**9 + ns, len(frame)))
-        if frame[46:48] == b"\\xff\\xfd":  # the end
+        if frame[50:52] == b"\\xff\\xfd":  # the end
             break
 print(json.dumps(frames))
 """
@@ -62,6 +64,8 @@ class Cell:
         self.radio, self.program, self.directory, self.content = radio, program, directory, content
         (directory / "content").write_bytes(content)
         (directory / "description").write_text(multicast.describe(content))
+        (directory / "key").write_text(KEY.hex())
+        self.transfer = multicast.Transfer(multicast.transfer_number(content), KEY)
 
     def file(self, robot: str) -> Path:
         return self.directory / robot
@@ -70,6 +74,7 @@ class Cell:
         argv: list[str | Path] = [
             f"--from={STATION}",
             f"--at={robot}",
+            f"--key={self.directory / 'key'}",
             *options,
             self.directory / "description",
             self.file(robot),
@@ -77,7 +82,13 @@ class Cell:
         return self.radio.nodes[robot].run("prlimit", f"--as={MEMORY}", self.program, *argv, cwd=self.directory)
 
     def send(self, robots: Sequence[str], rate: int = FAST) -> subprocess.Popen[str]:
-        argv: list[str | Path] = [f"--at={STATION}", f"--rate={rate}", self.directory / "content", *robots]
+        argv: list[str | Path] = [
+            f"--at={STATION}",
+            f"--key={self.directory / 'key'}",
+            f"--rate={rate}",
+            self.directory / "content",
+            *robots,
+        ]
         module = [sys.executable, "-m", "flotilla.updates.multicast"]
         return self.radio.nodes[STATION].run(*module, *argv, cwd=paths.PROJECT)
 
@@ -182,16 +193,15 @@ def test_no_second_carries_more_than_the_rate(quiet: Cell) -> None:
         second = [size for time, size in frames[at:] if time < began + 10**9]
         # A frame more, for the second begins with a frame; the wall clock is slewed by 0.05 % at most.
         assert 8 * sum(second) <= 1.001 * rate + 8 * max(second)
-    assert max(size for _, size in frames) <= 562
+    assert max(size for _, size in frames) <= 566
 
 
 def test_who_is_not_the_station_changes_nothing(quiet: Cell) -> None:
     """Seen to fail: a receiver that does not compare addresses, which ends at the stranger's word."""
     receiver = quiet.receive(ROBOTS[0])
-    number = multicast.transfer_number(quiet.content).to_bytes(4, "big")
     sender = quiet.send(ROBOTS[:1])
     quiet.radio.wait_for_frames(STATION, 100)  # so the receiver listens
-    quiet.say(STRANGER, number + b"\xff\xfd\0\0")
+    quiet.say(STRANGER, quiet.transfer.end())
     assert report(sender)["whole"] == ROBOTS[:1]
     assert ended(receiver) == "whole\n"
     assert quiet.file(ROBOTS[0]).read_bytes() == quiet.content
@@ -200,16 +210,52 @@ def test_who_is_not_the_station_changes_nothing(quiet: Cell) -> None:
 def test_a_symbol_that_changed_on_its_way_is_received_again(quiet: Cell) -> None:
     """Seen to fail: a receiver without the checksum, which says `whole` of a wrong file."""
     receiver = quiet.receive(ROBOTS[0])
-    number = multicast.transfer_number(quiet.content).to_bytes(4, "big")
     # The receiver listens as soon as it has its files.
     while not quiet.file(f"{ROBOTS[0]}.repair").exists():
         assert receiver.poll() is None
-    quiet.say(STATION, *[number + b"\0\0" + b"\0\1" + bytes(512)])
+    quiet.say(STATION, quiet.transfer.symbol(0, 1, multicast.Block(bytes(1024))))
     assert report(quiet.send(ROBOTS[:1]))["whole"] == ROBOTS[:1]
     out, err = receiver.communicate(timeout=SECONDS)
     assert (receiver.returncode, out) == (0, "whole\n")
     assert err == "flotilla-receive: block 0: wrong checksum: it is received again\n"
     assert quiet.file(ROBOTS[0]).read_bytes() == quiet.content
+
+
+def test_who_has_not_the_key_changes_nothing(quiet: Cell) -> None:
+    """From the station's address: symbols of both kinds and the end, by another key and of another transfer, and
+    datagrams with a changed tag, byte or number, or cut off. Seen to fail with a receiver that compares no tag, which
+    ends at the stranger's word."""
+    receiver = quiet.receive(ROBOTS[0])
+    while not quiet.file(f"{ROBOTS[0]}.repair").exists():
+        assert receiver.poll() is None
+    number = multicast.transfer_number(quiet.content)
+    block = multicast.Block(bytes(1024))
+    strangers = [multicast.Transfer(number, bytes(32)), multicast.Transfer(number + 1, KEY)]
+    datagrams = [
+        datagram
+        for stranger in strangers
+        for datagram in (stranger.symbol(0, 1, block), stranger.symbol(0, 2048, block), stranger.end())
+    ]
+    good = quiet.transfer.symbol(0, 1, block)
+    datagrams += [bytes(8) + good[8:], good[:-1] + b"x", good[:11] + b"\2" + good[12:], b"", good[:11]]
+    quiet.say(STATION, *datagrams)
+    assert report(quiet.send(ROBOTS[:1]))["whole"] == ROBOTS[:1]
+    assert ended(receiver) == "whole\n"
+    assert quiet.file(ROBOTS[0]).read_bytes() == quiet.content
+
+
+def test_an_answer_is_the_robots_that_has_the_key(quiet: Cell) -> None:
+    """The station believes no answer of somebody else, in the name of a robot that is silent."""
+    sender = multicast.Sender(quiet.content, IPv4Address("127.0.0.1"), [IPv4Address(ROBOTS[0])], KEY)
+    sender._ask()
+    nothing = multicast._HEADER.pack(multicast._ANSWERED, sender._question) + multicast._ANSWER.pack(1, 0)
+    for key, address in ((bytes(32), ROBOTS[0]), (KEY, ROBOTS[1])):
+        tag = multicast.Transfer(sender._transfer.number, key)._tag(nothing + IPv4Address(address).packed)
+        sender._take(ROBOTS[0], tag + nothing)
+        assert sender._robots[ROBOTS[0]].needs
+    tag = sender._transfer._tag(nothing + IPv4Address(ROBOTS[0]).packed)
+    sender._take(ROBOTS[0], tag + nothing)
+    assert not sender._robots[ROBOTS[0]].needs
 
 
 def test_who_never_answers_holds_nobody(quiet: Cell) -> None:
@@ -253,18 +299,31 @@ def test_a_wrong_option_is_named(program: Path, options: list[str], said: str) -
 def test_a_wrong_description_is_refused(program: Path, tmp_path: Path, text: str) -> None:
     """Seen to fail: a size without the checksums of its blocks."""
     (tmp_path / "description").write_text(text)
-    argv = [str(program), f"--from={STATION}", "--at=127.0.0.1", str(tmp_path / "description"), str(tmp_path / "file")]
+    (tmp_path / "key").write_text(KEY.hex())
+    argv = [str(program), f"--from={STATION}", "--at=127.0.0.1", f"--key={tmp_path / 'key'}"]
+    argv += [str(tmp_path / "description"), str(tmp_path / "file")]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=SECONDS, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(f"flotilla-receive: {tmp_path}/description: ")
 
 
+@pytest.mark.parametrize("text", ["", KEY.hex()[:-1], KEY.hex()[:-1] + "g", KEY.hex()[:-2]])
+def test_a_wrong_key_is_refused(program: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / "key").write_text(text)
+    (tmp_path / "description").write_text(multicast.describe(b"x"))
+    argv = [str(program), f"--from={STATION}", "--at=127.0.0.1", f"--key={tmp_path / 'key'}"]
+    argv += [str(tmp_path / "description"), str(tmp_path / "file")]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=SECONDS, check=False)
+    assert (done.returncode, done.stderr) == (2, f"flotilla-receive: {tmp_path}/key: Invalid argument\n")
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["file"], "the following arguments are required: --at, and addresses of robots"),
-        ([f"--at={STATION}", "file"], "the following arguments are required: --at, and addresses of robots"),
-        ([f"--at={STATION}", "--rate=0", "file", ROBOTS[0]], "--rate: 0: give bits a second, 1 or more"),
+        (["file"], "the following arguments are required: --at, --key, and addresses of robots"),
+        ([f"--at={STATION}", "file"], "the following arguments are required: --at, --key, and addresses of robots"),
+        ([f"--at={STATION}", "--key=file", "file", ROBOTS[0]], "file: is no key: give 64 hexadecimal digits"),
+        ([f"--at={STATION}", "--key=file", "--rate=0", "file", ROBOTS[0]], "--rate: 0: give bits a second, 1 or more"),
         (["--describe", "empty"], "empty: is empty: there is nothing to send"),
         (["--describe", "none"], "[Errno 2] No such file or directory: 'none'"),
     ],

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from flotilla.common import paths
+from flotilla.updates import multicast
 
 SCRIPT = paths.OVERLAY / "usr/lib/flotilla/receive"
 SPOOL = "/data/update/spool"
@@ -42,9 +43,10 @@ class Robot:
         assert done.returncode == status, done.stderr
         return done.stdout + done.stderr
 
-    def begin(self, number: int, size: int = SIZE, status: int = 0) -> str:
+    def begin(self, number: int, size: int = SIZE, status: int = 0, key: int = 1) -> str:
         text = f"transfer {number:08x}\nsize {size}\nblock 00000001\n"
-        return self.receive("begin", "10.0.0.254", "10.0.0.1", description=text, status=status)
+        order = multicast.order(bytes([key]) * multicast.KEY_BYTES, text)
+        return self.receive("begin", "10.0.0.254", "10.0.0.1", description=order, status=status)
 
     def calls(self) -> list[str]:
         """Of the service manager, since this was asked before."""
@@ -75,7 +77,8 @@ def robot(tmp_path: Path) -> Robot:
 def test_what_was_received_of_the_same_file_stays(robot: Robot) -> None:
     """And a service that runs is left alone. Seen to fail where each call begins anew."""
     assert robot.begin(1) == ""
-    assert robot.calls() == ["stop flotilla-receive", "restart flotilla-receive"]
+    assert robot.calls() == ["stop flotilla-receive"] * 2 + ["restart flotilla-receive"]
+    assert (robot.spool / "key").read_text() == f"{'01' * 32}\n"
     assert (robot.spool / "addresses").read_text() == "STATION=10.0.0.254\nROBOT=10.0.0.1\n"
     (robot.spool / "file.part").touch()
     robot.state("running")
@@ -84,7 +87,34 @@ def test_what_was_received_of_the_same_file_stays(robot: Robot) -> None:
     robot.state("exited")
     robot.begin(1)
     assert robot.calls() == ["restart flotilla-receive"]
-    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description", "file.part"]
+    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description", "file.part", "key"]
+
+
+def test_another_key_begins_anew_with_what_was_received(robot: Robot) -> None:
+    """Seen to fail: the service went on with the former key, and took nothing any more."""
+    robot.begin(1)
+    (robot.spool / "file.part").touch()
+    robot.calls()
+    robot.state("running")
+    robot.begin(1, key=2)
+    assert "stop flotilla-receive" in robot.calls()
+    assert (robot.spool / "key").read_text() == f"{'02' * 32}\n"
+    assert (robot.spool / "file.part").exists()
+
+
+def test_what_is_not_what_it_should_be_is_discarded(robot: Robot) -> None:
+    robot.begin(1)
+    (robot.spool / "file").touch()
+    robot.calls()
+    assert robot.receive("discard") == ""
+    assert robot.calls() == ["restart flotilla-receive"]
+    assert not robot.spool.exists()
+
+
+@pytest.mark.parametrize("order", ["", "transfer 1\n", "key\n", "key 1 2\n"])
+def test_no_key_is_refused(robot: Robot, order: str) -> None:
+    robot.receive("begin", "10.0.0.254", "10.0.0.1", description=order, status=2 if order else 1)
+    assert robot.calls() == []
 
 
 def test_another_file_takes_the_place_of_one_that_was_not_ended(robot: Robot) -> None:
@@ -93,7 +123,7 @@ def test_another_file_takes_the_place_of_one_that_was_not_ended(robot: Robot) ->
     for name in ("file", "file.part", "file.repair"):
         (robot.spool / name).touch()
     robot.begin(2)
-    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description"]
+    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description", "key"]
     assert "00000002" in (robot.spool / "description").read_text()
 
 

@@ -210,6 +210,22 @@ def test_what_was_cut_off_goes_on(robot: Robot) -> None:
     robot.take(text, "alice", "bob")
 
 
+def test_a_wrong_chunk_spoils_no_other(robot: Robot) -> None:
+    """Seen to fail: what came after it was thrown away, each time anew."""
+    text = manifest_of(robot.blob, header_of(robot.blob))
+    robot.begin(text, robot.sign(text, "alice", "bob"))
+    robot.run("copy")
+    contents = {number: robot.blob[number * CHUNK : (number + 1) * CHUNK] for number in (12, 13, 14)}
+    contents[13] = bytes(CHUNK)
+    frames = b"".join(
+        number.to_bytes(4, "little") + CHUNK.to_bytes(4, "little") + content for number, content in contents.items()
+    )
+    with pytest.raises(robot.module.Refused, match="chunk 13 is not what the release says"):
+        robot.run("write", frames)
+    told = robot.begin(text, robot.sign(text, "alice", "bob"))
+    assert {12, 13, 14} & {*told["missing"]} == {13}
+
+
 def test_a_new_release_empties_the_slot_first(robot: Robot) -> None:
     text = manifest_of(robot.blob, header_of(robot.blob))
     robot.take(text, "alice", "bob")

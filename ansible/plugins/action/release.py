@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import shlex
 import time
 from ipaddress import IPv4Address
@@ -99,6 +100,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
                     "file": str(each.file),
                     "robots": each.robots,
                     "description": multicast.describe(each.file.read_bytes()),
+                    "key": secrets.token_hex(multicast.KEY_BYTES),
                 }
                 for each in found
             ],
@@ -111,7 +113,8 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             return {"listens": False}
         argv = [RECEIVE, "begin", shared["station"], str(self._robot()[1].address)]
         try:
-            self._run(shlex.join(argv), shipment["description"].encode())
+            order = multicast.order(bytes.fromhex(shipment["key"]), shipment["description"])
+            self._run(shlex.join(argv), order.encode())
         except AnsibleActionFail as error:
             self._say(f"{self._name}: {error}; it gets its own copy")
             return {"listens": False}
@@ -135,7 +138,8 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             size = progress.size(len(content))
             self._say(f"{size} to {len(robots)} robots at once, {rate // 1000} kbit/s: {shipment['command']}")
             try:
-                sender = multicast.Sender(content, IPv4Address(shared["station"]), robots, rate=rate)
+                key = bytes.fromhex(shipment["key"])
+                sender = multicast.Sender(content, IPv4Address(shared["station"]), robots, key, rate=rate)
             except OSError as error:
                 self._say(f"no multicast from {shared['station']}: {error.strerror}; each robot gets its own copy")
                 continue
@@ -175,12 +179,27 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         return {"changed": True, "told": told, "sent_bytes": sent}
 
     def _take_received(self, shipment: dict[str, Any]) -> dict[str, Any] | None:
-        """What the robot says after it took the file that it received; None where that is not whole."""
+        """What the robot says after it took the file that it received; None where that is not whole.
+
+        Where the file is not what the release says, SSH brings what is missing, and nothing of it stays for a later
+        call.
+        """
         if not (self._task.args.get("listening") or {}).get("listens"):
             return None
         if not (file := self._run(f"{RECEIVE} end").strip()):
             return None
-        return self._told(self._run(f"{UPDATE} {shipment['command']} <{shlex.quote(file)}"))
+        try:
+            told = self._told(self._run(f"{UPDATE} {shipment['command']} <{shlex.quote(file)}"))
+        except AnsibleActionFail as error:
+            self._say(f"{self._name}: {error}; what is missing comes by SSH")
+            self._run(f"{RECEIVE} discard")
+            return self._begun()
+        if told["missing"] and shipment["command"] == "delta":
+            self._run(f"{RECEIVE} discard")
+        return told
+
+    def _begun(self) -> dict[str, Any]:
+        return self._update("begin", release.read(self._lack().bundle).offer)
 
     def _lack(self) -> staging.Lack:
         asked = self._task.args["asked"]

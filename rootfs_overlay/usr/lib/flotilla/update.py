@@ -323,9 +323,15 @@ def write() -> dict[str, Any]:
     if release.running:
         raise Refused("this release runs already")
     release.empty_slot()
+    wrong = None
     for number, content in frames(sys.stdin.buffer):
-        release.take(number, content)
+        try:
+            release.take(number, content)
+        except Refused as error:  # a wrong chunk spoils no other
+            wrong = wrong or error
     release.slot.flush()
+    if wrong:
+        raise wrong
     return release.said(release.missing())
 
 
