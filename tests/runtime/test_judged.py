@@ -10,6 +10,7 @@ import json
 import subprocess
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.interpolate import BPoly, CubicHermiteSpline
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_banded
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete, lfilter
 from scipy.spatial.transform import Rotation
@@ -169,22 +170,37 @@ def low_pass(random: Random) -> Draw:
     return Draw(it, {"a": a}, {"out": expected})
 
 
-def pid(random: Random) -> Draw:
-    """Linear, then limited; of angles in every second draw."""
+def wound(anti_windup: str, share: float, limit: float, growth: Array, others: Array) -> Array:
+    """The integral in each step, all at once: the steps that are beyond a limit make the rest linear, and follow from
+    it. `growth`: by the error; `others`: the output's other parts; `share`: of what is beyond, led back in a step."""
+    beyond, before = np.zeros(len(growth)), None
+    while not np.array_equal(beyond, before):
+        back = share * np.abs(beyond) if anti_windup == "back-calculation" else np.zeros(len(growth))
+        grown = np.where(beyond * growth > 0, 0, growth) if anti_windup == "clamping" else growth
+        change = grown + back * (beyond * limit - others)
+        integral = solve_banded((1, 0), [np.ones(len(growth)), back - 1], np.concatenate([[0], change[:-1]]))
+        before, beyond = beyond, np.where(np.abs(others + integral) > limit, np.sign(others + integral), 0)
+    return np.asarray(integral)
+
+
+def pid(random: Random, anti_windup: str = "none") -> Draw:
+    """Of angles in every second draw."""
     kp, ki, kd = (float(gain) for gain in random.normal(size=3))
+    ki *= 100  # so that it winds up
     smooth, limit = float(random.choice([0.0, 0.05])), float(random.uniform(1, 20))
-    turn = float(random.choice([0.0, 2 * np.pi]))
+    turn, tracking = float(random.choice([0.0, 2 * np.pi])), float(random.choice([PERIOD_S / 3, 0.05, 1.0]))
     a = signal(random, 3)
     error, measurement = a[:, 0] - a[:, 1], a[:, 1]
     if turn:
         error, measurement = np.angle(np.exp(1j * error)), np.unwrap(measurement)
-    integral = lfilter([0.0, ki * PERIOD_S], [1.0, -1.0], error)
     derivative = lfilter([1.0, -1.0], [smooth + PERIOD_S, -smooth], measurement - measurement[0])
-    wanted = kp * error + integral - kd * derivative + a[:, 2]
+    others = kp * error - kd * derivative + a[:, 2]
+    share = PERIOD_S / max(tracking, PERIOD_S)
+    wanted = others + wound(anti_windup, share, limit, ki * PERIOD_S * error, others)
     it = (
         '{type: pid, in: {set_point: "a.out[0]", measurement: "a.out[1]", feed_forward: "a.out[2]"}, parameters: {'
         f"kp: {kp!r}, ki: {ki!r}, kd: {kd!r}, filter: {smooth}, min: {-limit!r}, max: {limit!r}, turn: {turn!r}, "
-        "anti_windup: none}}"
+        f"anti_windup: {anti_windup}, tracking: {tracking}}}}}"
     )
     expected = {"out": np.clip(wanted, -limit, limit), "saturated": np.abs(wanted) > limit}
     return Draw(it, {"a": a}, expected)
@@ -442,6 +458,8 @@ JUDGED: dict[str, tuple[Callable[[Random], Draw], float]] = {
     "low-pass": (low_pass, 1e-12),
     "obstacle-stop": (obstacle_stop, 1e-12),
     "pid": (pid, 1e-11),
+    "pid, clamping": (partial(pid, anti_windup="clamping"), 1e-11),
+    "pid, back-calculation": (partial(pid, anti_windup="back-calculation"), 1e-11),
     "rotate": (rotate, 1e-13),
     "schmitt-trigger": (schmitt_trigger, 0),
     "select": (select, 0),
