@@ -173,7 +173,7 @@ def low_pass(random: Random) -> Draw:
 def wound(anti_windup: str, share: float, limit: float, growth: Array, others: Array) -> Array:
     """The integral in each step, all at once: the steps that are beyond a limit make the rest linear, and follow from
     it. `growth`: by the error; `others`: the output's other parts; `share`: of what is beyond, led back in a step."""
-    beyond, before = np.zeros(len(growth)), None
+    beyond, before = np.zeros(len(growth)), np.full(len(growth), np.nan)
     while not np.array_equal(beyond, before):
         back = share * np.abs(beyond) if anti_windup == "back-calculation" else np.zeros(len(growth))
         grown = np.where(beyond * growth > 0, 0, growth) if anti_windup == "clamping" else growth
