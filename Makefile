@@ -145,6 +145,7 @@ requirements: | setup ## lock the Python packages again from requirements/*.in
 	$(Q)$(locked) $(all_inputs) -o $(BUILD)/requirements.lock
 	$(Q)set -e; for each in $(all_inputs:.in=); do \
 	    $(locked) -c $(BUILD)/requirements.lock $$each.in -o $$each.lock; done
+	$(Q)$(subst --universal,--python-platform x86_64-manylinux_2_28,$(locked)) requirements/ros.in -o requirements/ros.lock
 
 ##@ Keys
 .PHONY: rotate-key revoke-key admit-operator revoke-operator operators backup-keys restore-keys

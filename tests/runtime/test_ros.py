@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import platform
 import re
 import subprocess
 import sys
@@ -257,6 +258,37 @@ def computer(cell: Radio) -> Callable[..., Any]:
     return start
 
 
+@pytest.fixture(scope="module")
+def ros() -> Path:
+    """The Python of an environment with ROS 2 itself."""
+    if sys.version_info[:2] != (3, 11) or platform.machine() != "x86_64":
+        pytest.skip("ROS 2 is on PyPI for Python 3.11 on x86_64 alone")
+    place, lock = paths.BUILD / "ros", paths.PROJECT / "requirements" / "ros.lock"
+    settings: list[str | Path] = [
+        sys.executable,
+        paths.PROJECT / "images" / "pip_settings.py",
+        Path(sys.executable).with_name("uv"),
+    ]
+    subprocess.run([*settings, "venv", "--quiet", "--allow-existing", "--python", sys.executable, place], check=True)
+    python = place / "bin" / "python"
+    # Not sync, which removes the packages within ROS's wheels as none of the lock's.
+    install = [*settings, "pip", "install", "--quiet", "--python", python, "--require-hashes", "-r", lock]
+    subprocess.run(install, cwd=paths.PROJECT, check=True)
+    return python
+
+
+@pytest.fixture
+def ros_computer(cell: Radio, ros: Path, tmp_path: Path) -> Callable[..., Any]:
+    """Its discovery by the robot's address, as a station has it, or by multicast."""
+
+    def start(*words: str) -> Any:
+        variables = [f"ROS_LOG_DIR={tmp_path}", f"ROS_STATIC_PEERS={ROBOT}", "PYTHONPATH="]
+        argv: list[str | Path] = ["env", *variables, ros, paths.PROJECT / "tests" / "runtime" / "ros_itself.py"]
+        return ended(cell.nodes[COMPUTER].run(*argv, *words, cwd=tmp_path))
+
+    return start
+
+
 def heard(process: subprocess.Popen[str]) -> dict[str, Any]:
     assert process.stdout
     line = process.stdout.readline()
@@ -286,6 +318,45 @@ def test_ros_reads_what_a_robot_publishes(name: str, cell: Radio, robot: Any, co
         assert begun <= message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec <= time.time()
     assert row["user_data"] == f"typehash={ROS.hash_rihs01(name)};"
     assert max(cell.sent[ROBOT]) < 1514, "IP had to fragment it"
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", CASES)
+def test_ros_itself_reads_what_a_robot_publishes(name: str, robot: Any, ros_computer: Any) -> None:
+    """Through Fast DDS and rclpy's messages. Seen to fail with two members of ros.idl exchanged."""
+    case = CASES[name]
+    strings = {path.rpartition(".")[2]: text for path, text in case.strings.items()}
+    begun = time.time()
+    with (
+        ros_computer("hear", name, "/robot3/it") as listener,
+        robot("ros-publish", "written", parameters(name, case, "robot3/it") | strings, case.values),
+    ):
+        assert listener.stdout
+        line = listener.stdout.readline()
+        assert line, listener.communicate()[1]
+    message = ROS.deserialize_cdr(bytes.fromhex(line), name)
+    assert {path: member(message, path) for path in case.members} == case.members
+    if case.strings:
+        assert begun <= message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec <= time.time()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", CASES)
+def test_a_robot_reads_what_ros_itself_publishes(name: str, robot: Any, ros_computer: Any) -> None:
+    case = CASES[name]
+    stamp = {"header.stamp": list(STAMP)} if case.strings else {}
+    said = (LITTLE_ENDIAN + encoded(name, case.members | stamp)).hex()
+    wanted = parameters(name, case, "/it") | {"timeout": 30}
+    if case.strings:
+        wanted["frame_id"] = case.strings["header.frame_id"]
+    with (
+        ros_computer("say", name, "/it", said),
+        robot("ros-subscribe", ",".join(["flag,stamp,refused", *case.ports]), wanted, {}) as process,
+    ):
+        row = Task(process).until(lambda row: row["flag"])
+    assert {port: row[port] for port in case.ports} == case.values
+    assert row["stamp"] == (STAMP[0] * 10**9 + STAMP[1] if stamp else 0)
+    assert row["refused"] == 0
 
 
 @pytest.mark.parametrize("name", ABSENT)
