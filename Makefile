@@ -4,14 +4,14 @@ VENV := $(or $(value BUILD),build)/venv
 ifeq ($(value BUILD),)
 BUILD := $(if $(value FLEET),$(value FLEET)/build,build)
 endif
-# Characters that paths in commands must not have; flotilla/common/paths.py has the same ones.
+# Characters that no path in a command may contain; flotilla/common/paths.py has the same ones.
 not_in_paths := ; & | < > ( ) ' " ` \ * ? [ ] { } ! $$ : % = \#
 in_path = $(strip $(foreach each,$(not_in_paths),$(findstring $(each),$(value $1))) $(word 2,$(value $1)))
 unfit = a path with blanks or with a character that means something to a shell;
 $(if $(call in_path,CURDIR),$(error $(CURDIR): this checkout lies on $(unfit) move it))
 $(foreach name,FLEET BUILD KEYS APPS INVENTORY,$(if $(call in_path,$(name)),$(error $(name)=$(value $(name)): is $(unfit) \
     take another directory)))
-# With sudo, what make writes would belong to root; flotilla/common/sudo.py refuses in the same words.
+# With sudo, the files that make writes would belong to root; flotilla/common/sudo.py has the same message.
 as_root := $(if $(filter-out 0,$(value SUDO_UID)),$(filter-out fleet-scale help,$(or $(MAKECMDGOALS),help)))
 $(if $(as_root),$(if $(filter 0,$(shell id -u)),$(if $(filter 0,$(shell stat -c %u .)),,$(error make $(as_root) needs no root: \
     run it without sudo))))

@@ -173,7 +173,7 @@ def _send_along(subject: app.App, description: app.Make, source: Path, out: Path
             shutil.copy(sent, taken)
     if description.files is None and (left := _left(subject, description, source)):
         listed = ", ".join(left[:5]) + (", …" if len(left) > 5 else "")
-        remedy = f"write files: [{left[0]}] for what the program needs there, files: [] for nothing"
+        remedy = f"write files: [{left[0]}] for the files that the program needs there, files: [] for none"
         raise UserError(f"{where}: files: (nothing): would leave {listed} here; {remedy}")
 
 

@@ -135,7 +135,7 @@ _UNKNOWN = (
         re.compile(
             r"(^|/)(rt\w*|rtw_\w+|look\w+|plook\w+|intrp\w+|mul_\w+|div_\w+|\w+_(types|private|data|shared|defines))\.h$"
         ),
-        f"part of the generated code, as files in slprj/ert/_sharedutils are; {_PACK}",
+        f"part of the generated code, such as the files in slprj/ert/_sharedutils; {_PACK}",
     ),
     (
         re.compile(""),
@@ -429,7 +429,7 @@ def _owned(model: Model, signal: Signal, used: list[str], sources: str) -> Signa
     rates = [number for number, text in enumerate(used) if re.search(pattern, text)]
     if len(rates) > 1:
         times = " and ".join(f"every {[model.own[0], *model.slower][rate].every}." for rate in rates)
-        remedy = "give the port one sample time, with a Rate Transition block behind it, or say tasking: single"
+        remedy = "give the port one sample time, with a Rate Transition block behind it, or write tasking: single"
         raise UserError(
             f"{GENERATED}/{model.name}.c: the root port {signal.name} is used in {times} step of the block; {remedy}"
         )
@@ -790,7 +790,7 @@ class _Reader:
         block = rf"port: '<Root>/{re.escape(port)}'"
         outward = re.search(rf"\bOut{block}", self.code.sources)
         if bool(outward) == bool(re.search(rf"\bIn{block}", self.code.sources)):
-            raise self._no(f"does not say whether the argument {parameter.name} is an input; {_TAKE_DEFAULT}")
+            raise self._no(f"does not show whether the argument {parameter.name} is an input; {_TAKE_DEFAULT}")
         return not outward
 
     def _call(self, function: str, number: int) -> str:

@@ -199,7 +199,7 @@ def _only(directory: Path) -> Path:
     if len(found) == 1:
         return found[0]
     what = ", ".join(path.name for path in found) or "none"
-    remedy = f"put one *.fmu there, or what is in it as {UNPACKED}/, or say unit: in {app.FILE}"
+    remedy = f"put one *.fmu there, or its content as {UNPACKED}/, or write unit: in {app.FILE}"
     raise UserError(f"{paths.shown(directory)}: has several units or none: {what}; {remedy}")
 
 
@@ -223,7 +223,9 @@ def read(directory: Path, shown: str) -> Unit:
         raise _wrong(file, "CoSimulation", "(nothing)", f"is missing, there is only {others or 'nothing'}", remedy)
     if _true(interface, "needsExecutionTool"):
         remedy = "export it with all that it needs, as sources or a binary"
-        raise _wrong(file, "needsExecutionTool", "true", "asks for the tool that made it, which robots lack", remedy)
+        raise _wrong(
+            file, "needsExecutionTool", "true", "needs the tool that made it, which robots do not have", remedy
+        )
     identifier, key = interface.get("modelIdentifier", ""), {"2": "guid", "3": "instantiationToken"}[version]
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", identifier):  # FMI allows no hyphens; tools write them
         raise _wrong(file, "modelIdentifier", identifier or "(nothing)", "is no identifier of C", "export it anew")
@@ -401,7 +403,7 @@ def _build_description(unit: Unit, file: Path, shown: str, platform: str) -> Sou
     chosen = fitting[0]
     for library in chosen.iterfind("Library"):
         if library.get("name") != "m":
-            message = "is a library that robots lack"
+            message = "is a library that robots do not have"
             raise _wrong(shown, "Library", str(library.get("name")), message, "export the unit without, or a binary")
     files: list[str] = []
     options: list[str] = []

@@ -172,11 +172,13 @@ def _task(work: Path, name: str, model: str, sample_times_s: Sequence[float], sy
             errors.append(error)
             continue
         if found.period_s is None:
-            raise UserError(f"{model}.h: its code says no period; say SAMPLE_TIMES=0.01, in seconds, fastest first")
+            raise UserError(
+                f"{model}.h: its code contains no period; give SAMPLE_TIMES=0.01, in seconds, fastest first"
+            )
         zeros = {port.name: _zeros(port.width) for port in found.inputs}
         wired = f", in: {json.dumps(zeros)}" if zeros else ""
         return (
-            f"# The model alone. `{name}.PORT` reads an output; docs/how-to/control-tasks.md says what else there is.\n"
+            f"# The model alone. `{name}.PORT` reads an output; docs/how-to/control-tasks.md describes the rest.\n"
             f"period: {found.period_s * 1000:g} ms\npriority: 64\nblocks:\n  {name}: {{type: {name}{wired}}}\n"
         )
     raise errors[0]

@@ -89,7 +89,7 @@ class Connection:
                     for last in _lines(process.stderr):
                         left -= len(last)
                         if left < 0:
-                            raise UserError(f"{self.robot.name}: says more than {_ANSWER_BYTES >> 20} MiB; look there")
+                            raise UserError(f"{self.robot.name}: sent more than {_ANSWER_BYTES >> 20} MiB; look there")
                         last = text.shown(last)
                         kept.write(last)
                         print(last, end="", file=sys.stderr, flush=True)
@@ -99,7 +99,7 @@ class Connection:
                     process.terminate()
         if process.returncode:
             raise self.error(
-                process.returncode, f"{(failed or last).strip()}; what it said is above and in {paths.shown(log)}"
+                process.returncode, f"{(failed or last).strip()}; its output is above and in {paths.shown(log)}"
             )
 
     def error(self, status: int, message: str) -> UserError:
@@ -111,7 +111,7 @@ class Connection:
             return UserError(f"{name}: {message or f'status {status}'}")
         if "Host key verification failed" in message or "IDENTIFICATION HAS CHANGED" in message:
             return UserError(
-                f"{name}: refused, because its host key is not the one of {paths.shown(paths.KEYS / 'known_hosts')}: "
+                f"{name}: rejected, because its host key is not the one of {paths.shown(paths.KEYS / 'known_hosts')}: "
                 "another robot's card is in it, its image was made with other keys, or somebody is in between\n"
                 + message
             )
@@ -323,7 +323,7 @@ def follow_log(to: Connection, name: str) -> None:
             finally:
                 process.terminate()
         if process.returncode:
-            raise to.error(process.returncode, "what it says is above")
+            raise to.error(process.returncode, "its output is above")
 
 
 def report(to: Connection, name: str) -> str:

@@ -48,7 +48,7 @@ def _flash_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
     parser.add_argument("device", type=Path, nargs="?", help="the card: /dev/sdX")
     parser.add_argument("--file", type=Path, help="a file instead of a card")
-    parser.add_argument("--force", help="the word that an earlier refusal named")
+    parser.add_argument("--force", help="the word that an earlier error named")
     parser.add_argument("--yes", action="store_true", help="do not ask")
 
 
@@ -75,7 +75,7 @@ def _verify(arguments: argparse.Namespace) -> None:
 
 def _verify_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
-    parser.add_argument("--plant", action="store_true", help="plant a difference, which must be found")
+    parser.add_argument("--plant", action="store_true", help="inject a difference, which the comparison must find")
 
 
 def _verify_bundle(arguments: argparse.Namespace) -> None:
@@ -165,7 +165,9 @@ def _cve_arguments(parser: argparse.ArgumentParser) -> None:
     from datetime import date
 
     parser.add_argument("--tracker", metavar="FILE", help="the security tracker's data, or their address")
-    parser.add_argument("--today", type=date.fromisoformat, metavar="DATE", help="judge ages as of then: 2026-01-31")
+    parser.add_argument(
+        "--today", type=date.fromisoformat, metavar="DATE", help="compute ages as of this day: 2026-01-31"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
@@ -240,8 +242,8 @@ def _revoke_key(arguments: argparse.Namespace) -> None:
     robot = inventory.robot(fleet, arguments.robot)
     keys.revoke_host_key(fleet, robot)
     print(
-        f"{robot.name}: its host key is refused here; `make provision` has the others refuse it. Its next card, by "
-        f"`make image ROBOT={robot.number}`, has a new one"
+        f"{robot.name}: this station rejects its host key; after `make provision` the other robots reject it. Its next "
+        f"card, by `make image ROBOT={robot.number}`, has a new one"
     )
 
 
@@ -279,7 +281,7 @@ def _revoke_operator(arguments: argparse.Namespace) -> None:
     from flotilla.fleet import operators
 
     operators.revoke(arguments.name)
-    print(f"{arguments.name}: robots refuse all certificates of that name once they have the list: `make provision`")
+    print(f"{arguments.name}: robots reject all certificates of that name once they have the list: `make provision`")
 
 
 def _revoke_operator_arguments(parser: argparse.ArgumentParser) -> None:
@@ -654,14 +656,14 @@ COMMANDS = (
     Command("Inputs", "init", "make a home for a fleet of your own", _init, _init_arguments),
     Command("Inputs", "check-fleet", "check the fleet's description", _check_fleet),
     Command("Inputs", "lock", "resolve the package lists to exact versions", _lock, _lock_arguments),
-    Command("Inputs", "cve", "name known vulnerabilities of what the locks hold", _cve, _cve_arguments),
+    Command("Inputs", "cve", "check the locks against Debian's security tracker", _cve, _cve_arguments),
     Command("Keys", "rotate-key", "make a new host key of a robot, or a new operator's key", _rotate_key,
             _rotate_key_arguments),
-    Command("Keys", "revoke-key", "refuse the host key of a robot that is in other hands", _revoke_key,
+    Command("Keys", "revoke-key", "revoke the host key of a stolen robot", _revoke_key,
             robot_argument),
     Command("Keys", "admit-operator", "sign a certificate that lets a person into all robots for some days",
             _admit_operator, _admit_operator_arguments),
-    Command("Keys", "revoke-operator", "refuse a person's certificates", _revoke_operator, _revoke_operator_arguments),
+    Command("Keys", "revoke-operator", "revoke a person's certificates", _revoke_operator, _revoke_operator_arguments),
     Command("Keys", "operators", "show who has a certificate, and until when", _operators),
     Command("Keys", "backup-keys", "write all keys to one encrypted file", _backup_keys, _key_backup_arguments),
     Command("Keys", "restore-keys", "put them back", _restore_keys, _key_backup_arguments),
@@ -670,7 +672,7 @@ COMMANDS = (
     Command("Robots", "scope", "print or record signals of a running task or app", _scope, _scope_arguments),
     Command("Robots", "releases", "show which release each robot runs", _releases, _releases_arguments),
     Command("Robots", "hwcheck", "report a robot's hardware", _hwcheck, _hwcheck_arguments),
-    Command("Robots", "provision", "make robots what the inventory says", _provision, _provision_arguments),
+    Command("Robots", "provision", "apply the inventory to the robots", _provision, _provision_arguments),
     Command("Robots", "station", "serve a page to see the fleet, drive and record it", _page, _page_arguments,
             packages="station"),
     Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments,
@@ -685,7 +687,7 @@ COMMANDS = (
             _station_time_arguments),
     Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments,
             packages="station"),
-    Command("Robots", "positions", "send the positioning system's positions to a robot, with proof", _positions,
+    Command("Robots", "positions", "forward indoor positions to a robot, authenticated", _positions,
             _positions_arguments, packages="station"),
     Command("Robots", "fetch", "bring a robot's recorder files to this computer", _fetch, _fetch_arguments),
     Command("Robots", "convert", "make MCAP, CSV or MAT of recordings", _convert, _convert_arguments,
@@ -693,7 +695,7 @@ COMMANDS = (
     Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments,
             packages="station"),
     Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
-    Command("Apps", "import-model", "make an app of what MATLAB's packNGo packed, or renew its code", _import_model,
+    Command("Apps", "import-model", "make an app of MATLAB's packNGo archive, or renew its code", _import_model,
             _import_model_arguments),
     Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
     Command("Shell", "completion", "print what makes a shell complete these words", _completion,

@@ -44,7 +44,7 @@ def parser(known: Sequence[Command], detailed: Callable[[Command], bool]) -> arg
     main = argparse.ArgumentParser(
         prog="flotilla",
         description="Real-time Linux card images for a fleet of robots, and what is done with them.",
-        epilog=f"{listed}\n\n`flotilla COMMAND --help` says more.",
+        epilog=f"{listed}\n\n`flotilla COMMAND --help` shows the arguments of a command.",
         formatter_class=_Help,
         usage="flotilla COMMAND …",
     )

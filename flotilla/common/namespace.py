@@ -74,9 +74,9 @@ _USERS = 65536
 
 
 def cause(stderr: str, *, user: bool | None = None) -> str:
-    """Why this computer refuses a namespace, with the remedy; empty where the cause is none of the known ones.
+    """Why this computer does not permit a namespace, with the remedy; empty where the cause is none of the known ones.
 
-    `stderr`: what the refused program wrote. `user`: whether root asked for a user namespace, too.
+    `stderr`: the output of the failed program. `user`: whether root asked for a user namespace, too.
     """
     root = os.geteuid() == 0
     contained = any(file.exists() for file in _CONTAINERS)
@@ -97,7 +97,7 @@ def cause(stderr: str, *, user: bool | None = None) -> str:
         return "this kernel has no user namespaces (CONFIG_USER_NS); build on a computer whose kernel has them"
     if contained:
         return (
-            "this container refuses them; start it with `docker run --security-opt seccomp=unconfined --security-opt "
+            "this container forbids them; start it with `docker run --security-opt seccomp=unconfined --security-opt "
             "apparmor=unconfined --security-opt systempaths=unconfined …`, or with these options of podman"
         )
     return ""

@@ -11,8 +11,8 @@ this checkout, with the example fleet.
 | `keys/` | `ansible/keys/` |
 | `overlay/`, `packages/`, `locks/`, `kernel/` | `rootfs_overlay/`, `images/packages/`, `images/locks/`, `kernel/` |
 
-The folders of the last row contain only what differs: `flotilla.common.sources.find` takes each other file from the
-checkout."""
+The folders of the last row contain only files that differ: `flotilla.common.sources.find` takes all other files from
+the checkout."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HOME_FILE = "fleet.yml"
 
 
 def _place(variable: str, in_home: str, in_checkout: str) -> Path:
-    """What the environment names, or else the usual place."""
+    """The path that the environment names, or else the usual place."""
     return Path(os.environ.get(variable) or HOME / (in_home if OWN_HOME else in_checkout)).resolve()
 
 

@@ -1,7 +1,7 @@
 """Commands that somebody runs through sudo: they leave files that belong to root, which that user cannot change.
 
-Only a command that declares so needs root. All others refuse to run: nothing could hand back what a killed run has
-left, and make, pip and compilers would be root for nothing. The few hand their files back when they end.
+Only a command that declares so needs root. All others end with an error: after a killed run nothing would return its
+files to the user, and make, pip and compilers would be root for nothing. The few return their files when they end.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Caller(NamedTuple):
     user: int
     group: int
     places: tuple[Path, ...]
-    """Where files of root are handed back."""
+    """Where files of root are returned to the user."""
 
 
 def caller(environment: Mapping[str, str] = os.environ) -> Caller | None:
@@ -38,7 +38,7 @@ def caller(environment: Mapping[str, str] = os.environ) -> Caller | None:
 
 
 def refusal(command: str) -> UserError:
-    """The Makefile refuses in the same words before it makes anything."""
+    """The Makefile has the same message, before it makes anything."""
     return UserError(f"{command} needs no root: run it without sudo")
 
 

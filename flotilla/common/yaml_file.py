@@ -166,7 +166,7 @@ _EXPLANATIONS = {
 """By pydantic's error type: what is wrong, what would be right."""
 
 
-UNEXPLAINED = "the comments in the file say what it may be"
+UNEXPLAINED = "the comments in the file list its values"
 """The remedy of last resort."""
 
 

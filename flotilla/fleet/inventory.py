@@ -376,7 +376,7 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
             (len(own) > 1, f"stands in several board groups: {inside}", "leave it in one of them"),
             (
                 own and "robots" not in of,
-                f"stands in {inside}, which robots lacks",
+                f"stands in {inside}, which is not below robots",
                 "list the board in robots' children",
             ),
             (kind == "robots" and "stations" in of, "is robot and station", "leave it in one of the groups"),
@@ -401,7 +401,7 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
             findings.append((("boards", name), "is not described", "copy another board's file to this one"))
         elif isinstance(board, dict):
             if "name" in board:
-                findings.append((("boards", name, "name"), "is not known", f"remove it: the group says it, {name}"))
+                findings.append((("boards", name, "name"), "is not known", f"remove it: the group {name} defines it"))
             raw["boards"][name] = board | {"name": name}
     if not raw["robots"]:
         findings.append((("robots",), "there are no robots", "add one to the group robots in robots.yml"))

@@ -116,7 +116,11 @@ def _streams(name: str, message: Message, messages: Messages) -> Iterator[Findin
         if not name.removeprefix(f"{message.sender}-") or not name.startswith(f"{message.sender}-"):
             yield (), "is not named after its sender, as streams are", f"such as {message.sender}-report"
         if message.standby:
-            yield ("standby",), "stations tell robots apart, and get what each sends", "remove it"
+            yield (
+                ("standby",),
+                "stations distinguish robots by their addresses, and receive from each robot",
+                "remove it",
+            )
         if message.charge and (not charge or charge.width > 1 or charge.type not in ("single", "double")):
             yield ("charge",), "is not a signal of one single or double", "one of signals, or remove it"
         for index, counted in enumerate(message.attempts):
@@ -153,7 +157,7 @@ def _signals(name: str, message: Message, messages: Messages) -> Iterator[Findin
         if len(described.unit) not in (0, 1, described.width):
             yield (
                 ("signals", signal, "unit"),
-                f"says {len(described.unit)} units of {described.width} elements",
+                f"has {len(described.unit)} units for {described.width} elements",
                 "one for all, or one for each",
             )
         # protobuf's names of fields in JSON lack underscores, and have to differ.

@@ -624,7 +624,7 @@ class Fleet(_Model):
             names = " and ".join(robot.name for robot in first) or "no robot"
             raise UserError(
                 f"control task {task}: {names} has it, and another task talks to the one that has; "
-                "a further robot may stand by for it: standby in robots.yml"
+                "a further robot may be its hot standby: standby in robots.yml"
             )
         return first + [robot for robot in there if task in robot.standby]
 
@@ -633,7 +633,7 @@ class Fleet(_Model):
         robot, *others = self.robots_with(task)
         if others:
             raise UserError(
-                f"control task {task}: no robot can stand by for it, and {others[0].name} does; "
+                f"control task {task}: no robot can be its hot standby, and {others[0].name} is; "
                 "remove it from standby and control_tasks there"
             )
         return robot

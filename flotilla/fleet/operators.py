@@ -136,7 +136,7 @@ def _check(admissions: list[Admission], name: str, file: Path, key: str, now: da
         # To revoke such a key, the operator's for one, would lock everybody out.
         raise UserError(f"{shown_file}: is a key of {paths.shown(paths.KEYS)}; take one of {name}'s own")
     if key in refused:
-        raise UserError(f"{shown_file}: this key was revoked, and robots refuse it; {name} needs a new one")
+        raise UserError(f"{shown_file}: this key was revoked, and robots reject it; {name} needs a new one")
     for each in admissions:
         if each.key == key and each.name != name:
             raise UserError(f"{shown_file}: is the key of {each.name}, who was admitted; {name} needs one of their own")

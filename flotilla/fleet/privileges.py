@@ -138,7 +138,7 @@ def shared_devices(descriptions: Mapping[str, object]) -> Iterator[tuple[str, st
     for name, description in descriptions.items():
         for device in sorted(devices(description)):
             if (other := first.setdefault(device, name)) != name:
-                yield name, f"{DEVICES}{device} is open in {other} too: read it in one task, and send what it says"
+                yield name, f"{DEVICES}{device} is open in {other} too: read it in one task, and send its values"
 
 
 def drives_io_ports(description: object, needs: Needs | None = None, inside: Collection[str] = ()) -> bool:

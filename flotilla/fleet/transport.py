@@ -150,7 +150,7 @@ def problems(fleet: Fleet, name: str, task: object) -> Iterator[str]:
         if described.sender == name and not isclose(described.step_s, period_s):
             yield (
                 f"period: {period}: with it {message} comes {1 / (period_s * described.every):g} times a second, "
-                f"and {_file()} says {described.rate_hz:g}; correct period, or rate_hz or every there"
+                f"and {_file()} has {described.rate_hz:g}; correct period, or rate_hz or every there"
             )
 
 

@@ -35,8 +35,8 @@ def judge(number: int, found: Mapping[str, Mapping[str, Any]], wanted: Sequence[
             verdict.actions.append((name, "clear"))
         elif name not in given:
             verdict.notes.append(
-                f"app {name} was brought by hand and stays; give it to the robot (apps: in robots.yml), or remove it: "
-                f"make deploy ROBOT={number} APP=apps/{name} RUN=remove"
+                f"app {name} was deployed manually and is kept; give it to the robot (apps: in robots.yml), or remove "
+                f"it: make deploy ROBOT={number} APP=apps/{name} RUN=remove"
             )
     for app in wanted:
         _judge_one(app, found.get(app.name), verdict)
@@ -66,7 +66,9 @@ def _wrong(app: BuiltApp, it: Mapping[str, Any]) -> list[str]:
         if it["version"] == it["listed"]:
             return [f"is version {it['version']}, and the inventory's is {app.version}"]
         return [
-            f"is version {it['version']}, brought by hand, and the inventory's is {app.version}: to go on with it, "
+            f"is version {it['version']}, deployed manually, and the inventory's is {app.version}: to keep it, "
             f"take {app.name} out of the robot's apps, or change apps/{app.name}"
         ]
-    return [f"is not as built: {line}" for line in it["files"]] + ([] if it["drop_in"] else ["lacks its unit.d"])
+    return [f"is not as built: {line}" for line in it["files"]] + (
+        [] if it["drop_in"] else ["does not have its unit.d"]
+    )

@@ -122,7 +122,7 @@ def _bring(robot: Robot, task: str, each: _Remote, begin: int, file: Path, came:
             if not _append(robot, task, each, begin, out.write, came):
                 return False
         if part.stat().st_size < each.size:
-            raise UserError(f"{robot.name}: {each.name}: ended too early; fetch again, it goes on from there")
+            raise UserError(f"{robot.name}: {each.name}: ended too early; fetch again, to resume there")
         durable.rename(part, file)
     except OSError as error:
         raise UserError(f"{paths.shown(file)}: {error.strerror}; make room, or name another place: OUT=") from error

@@ -48,7 +48,7 @@ def _of_task(unit: str, status: Any, wanted: Health) -> Iterator[str]:
     if not status:  # it does not run, which is its unit's affair
         return
     if "problem" in status:
-        yield f"{task} does not say how it does: {status['problem']}"
+        yield f"{task} does not report its status: {status['problem']}"
         return
     overruns, steps = status["lately"]["overruns"], status["lately"]["steps"]
     if 100 * overruns > wanted.overruns_percent * steps:

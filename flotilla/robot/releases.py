@@ -127,7 +127,7 @@ def _read(robot: Robot, text: str, now: datetime) -> Answer:
         first = error.errors()[0]
         why = ": ".join([*map(str, first["loc"]), first["msg"]])
     remedy = "use the station's checkout of the robot's release"
-    return Answer(robot, problem=f"{robot.name}: says something else than the state of its slots ({why}); {remedy}")
+    return Answer(robot, problem=f"{robot.name}: does not report the state of its slots ({why}); {remedy}")
 
 
 def problems(answers: Sequence[Answer]) -> list[str]:

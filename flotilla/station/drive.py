@@ -124,7 +124,7 @@ def _remarks(report: Mapping[str, Value], state: State) -> Iterator[str]:
     if not report["seeing"]:
         yield "sees nothing"
     elif report["limited"]:
-        yield "slowed by what it sees"
+        yield "slowed by an obstacle"
     for name in ("left", "right", "boom"):
         if code := report[f"{name}_error"]:
             yield f"drive {name}: error {code:#06x}"

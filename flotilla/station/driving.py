@@ -319,7 +319,7 @@ class Driving:
                 if channel.stop and now_s < channel.stop_until_s:
                     self._send_stop(channel)
                 elif hold and now_s - hold.heard_s > SILENT_S:
-                    self._end(channel, f"{hold.operator.name} said nothing for {SILENT_S:g} s and commands no more")
+                    self._end(channel, f"{hold.operator.name} was silent for {SILENT_S:g} s and lost control")
                 elif hold and (motion := self._due(channel, now_s)[0]):
                     self._transmit(channel, hold, motion)
 

@@ -186,7 +186,7 @@ def _plain(chunk: Chunk) -> Chunk:
     else:
         data = chunk.data
     if len(data) != size:
-        raise ValueError("a chunk of another size than it says")
+        raise ValueError("a chunk of another size than its header specifies")
     return dataclasses.replace(chunk, compression="", data=data)
 
 

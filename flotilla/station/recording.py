@@ -142,7 +142,7 @@ def parse_header(data: bytes) -> Header:
         for field in fields:
             _check_field(field, bytes_of_record)
         if not {"time_ns", "step"} <= {field.name for field in fields} or len({f.name for f in fields}) < len(fields):
-            raise ValueError("it lacks time_ns or step, or has a field twice")
+            raise ValueError("it has no time_ns or step, or has a field twice")
         name, period_ns, wall_ns = str(schema["name"]), int(schema["period_ns"]), int(schema["wall_less_monotonic_ns"])
         if not 0 < period_ns < _MOST_NS or abs(wall_ns) >= _MOST_NS:
             raise ValueError("its times are none")

@@ -149,7 +149,7 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
             lines: list[str] = []
             for line in iter(partial(process.stdout.readline, 2 * _LONGEST), ""):
                 if not line.endswith("\n"):
-                    raise UserError(f"{robot.name}: says of its tasks a line that does not end")
+                    raise UserError(f"{robot.name}: sends a line about its tasks that does not end")
                 if line.rstrip() != _END and len(lines) < longest:
                     lines.append(line)
                     continue
@@ -160,7 +160,7 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
                     answer = Answer(before, (*odd, *_notes(cell.strip(), json.loads(flood), clock, data)))
                 except _NONSENSE as error:
                     what = shown(repr(error)[:200])
-                    raise UserError(f"{robot.name}: nobody understands what it says of its tasks: {what}") from error
+                    raise UserError(f"{robot.name}: its report of its tasks is invalid: {what}") from error
                 yield answer
                 lines = []
             raise ssh.no_answer(robot, shown(process.stderr.read(_LONGEST).strip()) or "the connection broke")
@@ -178,7 +178,7 @@ def _notes(cell: str, flood: dict[str, Any] | None, clock: str, data: str) -> It
         yield f"firewall dropped {packets} packets of a flood"
     came, valid = (sum(map(int, re.findall(rf"{name} *: (\d+)", clock))) for name in ("Total RX", "Total valid RX"))
     if came > valid:
-        yield f"clock refused {came - valid} answers that were not a time server's"
+        yield f"clock rejected {came - valid} answers that were not a time server's"
     if "ro" in re.split("[ ,]", data.strip()):
         yield READ_ONLY
 
@@ -219,7 +219,7 @@ def _reports(
                 raise ValueError(f"it is of {report.task}")
         except ValueError as error:  # as pydantic's errors are
             why = error.errors()[0]["msg"] if isinstance(error, pydantic.ValidationError) else str(error)
-            odd.append(f"{task} does not say how it does: its status is none: {shown(why[:_WORDS])}")
+            odd.append(f"{task} does not report its status: the answer is invalid: {shown(why[:_WORDS])}")
             continue
         past = before[task].status if task in before else None
         found[task] = _status_of(report, past)

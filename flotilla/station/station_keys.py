@@ -25,7 +25,7 @@ def shared(otherwise: str) -> MessageKeys:
 
 def of_telemetry(fleet: Fleet) -> KeyOf:
     """Keys of what robots tell the fleet's stations."""
-    keys = shared("nothing proves what robots say")
+    keys = shared("reports of robots cannot be authenticated")
     robots = {robot.name: robot for robot in fleet.robots.values()}
     stations = {str(station.address): station for station in fleet.stations}
 

@@ -119,7 +119,7 @@ def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> di
         names = ", ".join(key["name"] for key in trusted["keys"])
         raise UserError(
             f"{paths.shown(text)}: {len(signed)} of {trusted['signatures']} signatures; have more of {names} sign it: "
-            f"`ssh-keygen -Y sign -n {release_keys.NAMESPACE} -f KEY {text.name}`, then say what that makes: "
+            f"`ssh-keygen -Y sign -n {release_keys.NAMESPACE} -f KEY {text.name}`, then give the signature files: "
             'SIGNATURES="FILE ..."'
         )
     return signed

@@ -160,7 +160,7 @@ def read_tracker(tracker: str | None) -> dict[str, Any]:
     """The tracker's data by source and CVE, from a file or an address, packed by gzip or xz or not at all."""
     if not tracker:
         raise UserError(
-            "say where the security tracker's data are: `make cve TRACKER=FILE`, with what Debian publishes at\n"
+            "give the security tracker's data: `make cve TRACKER=FILE`, with the file that Debian publishes at\n"
             f"  {_ADDRESS}\n"
             "(some 80 MB; packed as FILE.gz or FILE.xz it may stay so), or TRACKER=ADDRESS, that one or a mirror's"
         )

@@ -284,7 +284,7 @@ class _Call:
 
 def _difference(file: File, received: Path) -> str:
     return (
-        f"has SHA-256 {_sha256(received)} and {received.stat().st_size} bytes, the lock says {file.sha256} and "
+        f"has SHA-256 {_sha256(received)} and {received.stat().st_size} bytes, the lock has {file.sha256} and "
         f"{file.size} bytes"
     )
 

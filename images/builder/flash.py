@@ -270,7 +270,7 @@ def _disk(device: Path, need: int, force: str | None, host: Host) -> Disk:
     findings = [check(disk, need) for check in checks if check != OVERRIDES.get(force or "")]
     wrong = [finding for finding in findings if finding]
     if wrong:
-        raise UserError("\n  ".join((f"{disk} was refused, nothing was written:", *wrong)))
+        raise UserError("\n  ".join((f"{disk} was rejected, nothing was written:", *wrong)))
     return disk
 
 
@@ -470,7 +470,7 @@ def _map(image: Path, remedy: str) -> BlockMap:
     bmap = read_bmap(bmap_of(image))
     size = image.stat().st_size
     if size != bmap.image_size:
-        raise UserError(f"{shown(image)} has {size} bytes, its block map says {bmap.image_size}; `{remedy}`")
+        raise UserError(f"{shown(image)} has {size} bytes, its block map has {bmap.image_size}; `{remedy}`")
     return bmap
 
 
@@ -483,7 +483,7 @@ def _confirm(disk: Disk, bmap: BlockMap, robot: str, yes: bool) -> None:
             "no terminal to ask on; a script gives --yes and a name from /dev/disk/by-id; nothing was written"
         )
     size = progress.size(bmap.image_size)
-    sys.stderr.write(f"Robot {robot}'s image ({size}) replaces all of it. Type {disk.name} to go on: ")
+    sys.stderr.write(f"Robot {robot}'s image ({size}) replaces all of it. Type {disk.name} to continue: ")
     sys.stderr.flush()
     try:
         answer = sys.stdin.readline().strip()

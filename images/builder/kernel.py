@@ -167,7 +167,7 @@ def merge(options: Iterable[Option]) -> dict[str, Option]:
             problems.append(
                 Problem(
                     option.place, f"CONFIG_{option.name}", option.value,
-                    f"contradicts {first.place}, which says {first.value}", "keep one of them",
+                    f"contradicts {first.place}, which has {first.value}", "keep one of them",
                 )
             )  # fmt: skip
     if problems:
@@ -223,7 +223,7 @@ def compare(options: Iterable[Option], config: str, kconfig: str) -> list[Proble
         entries = re.findall(rf"^(?:menu)?config {option.name}\n((?:[ \t].*\n|\n)*)", kconfig, re.MULTILINE)
         if entries:
             needs = sorted({need for entry in entries for need in re.findall(r"^\s+depends on (.+)$", entry, re.M)})
-            message = f"is refused by kconfig, which makes it {got}"
+            message = f"is changed by kconfig to {got}"
             remedy = f"it depends on {' and on '.join(needs)}" if needs else "another option selects or forbids it"
         else:
             known = known or re.findall(r"^(?:menu)?config (\w+)$", kconfig, re.MULTILINE)

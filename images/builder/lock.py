@@ -467,8 +467,8 @@ class Apt:
             self._run("apt-get", "update", "-q")
         except UserError as error:
             raise UserError(
-                f"{error}\nA lock holds only what the archive's signatures cover: run again later, or with another "
-                "MIRROR= and SECURITY_MIRROR="
+                f"{error}\nA lock contains only packages that the archive's signatures cover: run again later, or with "
+                "another MIRROR= and SECURITY_MIRROR="
             ) from None
 
     def index(self) -> dict[str, tuple[str, dict[str, str]]]:

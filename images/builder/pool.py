@@ -207,7 +207,9 @@ def control(package: Package) -> str:
         return deb.control(file(package))
     except ValueError as error:
         if not _damaged([package]):
-            raise UserError(f"package {package}: {error}; it is as the lock says: run `make lock`") from error
+            raise UserError(
+                f"package {package}: {error}; but its checksum is that of the lock: run `make lock`"
+            ) from error
         file(package).unlink()
         raise UserError(
             f"package {package}: {error}; {paths.shown(file(package))} was damaged and is removed: run again"

@@ -99,7 +99,7 @@ def _read(file: Path) -> Published:
     signatures = [texts.pop(name) for name in sorted(texts) if name.endswith(".sig")]
     bills = {name: hashlib.sha256(content).hexdigest() for name, content in texts.items()}
     if (manifest.chunks, manifest.bills) != (chunks, bills):
-        raise UserError(f"{paths.shown(file)}: holds something else than its manifest says; get it again")
+        raise UserError(f"{paths.shown(file)}: does not match its manifest; get it again")
     return Published(text, manifest, signatures)
 
 

@@ -70,7 +70,7 @@ def _description(asked: Asked) -> Iterator[Outcome]:
     board = f"compare `ports:` in board_{asked.robot.board}.yml with the board"
     yield _outcome(part, "serial ports", [f"no {tty}" for tty in missing], "all are there", board)
     failed = [f"{unit} failed" for unit in found["failed"]]
-    yield _outcome(part, "units", failed, "none failed", "`systemctl status` on the robot says why")
+    yield _outcome(part, "units", failed, "none failed", "`systemctl status` on the robot has the reason")
     drift = state.release_drift(found["release"], asked.facts.release)
     if asked.facts.release is None:
         absent = f"its image is not on this computer: make image ROBOT={asked.robot.number}"
@@ -103,7 +103,7 @@ def _computer(asked: Asked) -> Iterator[Outcome]:
     yield Outcome(
         part=part, what="clock source", state=asked.timed(holds=source == limits.clock_source),
         found=asked.words(f"{source} of {', '.join(found['clock_sources'])}"),
-        remedy=f"{limits.clock_source} is wanted: `dmesg` says why the kernel left it",
+        remedy=f"{limits.clock_source} is required: `dmesg` has the reason why the kernel left it",
     )  # fmt: skip
     off_s = found["battery_clock_off_s"]
     said = "there is none" if off_s is None else f"off by {off_s:.0f} s"
@@ -165,7 +165,7 @@ def _serial(asked: Asked) -> Iterator[Outcome]:
             wrong = [f"its UART is {fact['uart']}"]
             remedy = f"compare `ports:` in board_{asked.robot.board}.yml with the board and its jumpers"
         elif "error" in fact:
-            wrong, remedy = [fact["error"]], "its UART, or a driver that refuses loopback"
+            wrong, remedy = [fact["error"]], "its UART, or a driver without loopback"
         elif fact.get("came") is False:
             wrong, remedy = ["bytes do not come back through its own UART"], "its base address or interrupt is wrong"
         elif fact.get("came") and tty.startswith("ttyS") and not fact["interrupts"]:
@@ -182,7 +182,7 @@ def _links(asked: Asked) -> Iterator[Outcome]:
         if "missing" in found:
             yield _outcome(part, name, [found["missing"]], "", "its adapter, or its driver in `modules:`")
         elif "UP" not in found["flags"]:
-            yield _outcome(part, name, ["is down"], "", "`systemctl status` and `dmesg` on the robot say why")
+            yield _outcome(part, name, ["is down"], "", "`systemctl status` and `dmesg` on the robot have the reason")
         elif part == "CAN":
             can = found.get("linkinfo", {}).get("info_data", {})
             bad = can.get("state") not in (None, "ERROR-ACTIVE")
@@ -216,7 +216,7 @@ def _card(asked: Asked) -> Iterator[Outcome]:
         yield _outcome(part, f"slot {name}", wrong, "reads as it was written", "the card forgets: flash another one")
     short = found["disk_bytes"] - found["data_end_bytes"]
     wrong = [f"{short >> 20} MiB of the card are behind it"] if short > _GROWN_SLACK_BYTES else []
-    remedy = "`journalctl -u flotilla-grow` on the robot says why it did not grow"
+    remedy = "`journalctl -u flotilla-grow` on the robot has the reason why it did not grow"
     yield _outcome(part, "data partition", wrong, f"{found['data_bytes'] / 1e6:.0f} MB", remedy)
     free = found["data_free_bytes"] / found["data_bytes"]
     wrong = [f"{100 * free:.0f} % are free, less than {100 * _FREE:.0f}"] if free < _FREE else []
@@ -237,7 +237,7 @@ def _late(asked: Asked, what: str, worst_us: float, limit_us: int) -> Outcome:
     return Outcome(
         part="real time", what=what, state=asked.timed(holds=worst_us <= limit_us),
         found=asked.words(f"{worst_us:g} µs at the latest, at most {limit_us}"),
-        remedy="`make hwcheck`, `make latency TARGET=ssh:…` and docs/troubleshooting.md say where to look",
+        remedy="`make hwcheck`, `make latency TARGET=ssh:…` and docs/troubleshooting.md help to find the cause",
     )  # fmt: skip
 
 
@@ -291,8 +291,8 @@ CHECKS: Mapping[str, Callable[[Asked], Iterator[Outcome]]] = {
 BY_HAND = (
     "what leaves a serial connector: the UART's own loopback ends before the line drivers",
     "sensors that no control task of the robot reads",
-    "the radio's range, and power that is cut while it flies",
-    "the card's age: such cards do not tell it",
+    "the radio's range, and a power failure while the robot moves",
+    "the card's age: such cards do not report it",
 )
 """What only a person or a bench shows."""
 

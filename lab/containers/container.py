@@ -78,7 +78,7 @@ def check() -> None:
         probe = subprocess.run(inside(["sh", "-ec", script]), capture_output=True, text=True, check=False)
         if probe.returncode:
             raise UserError(
-                f"robots in containers need {what}, which this computer refuses: {probe.stderr.strip()}; "
+                f"robots in containers need {what}, which this computer does not permit: {probe.stderr.strip()}; "
                 "if it is a container, start it with --privileged, else take a computer whose kernel has them"
             )
 

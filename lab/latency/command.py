@@ -142,7 +142,7 @@ def _judge(system: System) -> str:
 def accept(arguments: argparse.Namespace) -> None:
     """Anew, not the last run: so it is of the system as it is now, and one command does for both kernels."""
     if arguments.plan != "quick":
-        raise UserError(f"--plan {arguments.plan}: has limits, not an accepted run; only quick has one")
+        raise UserError(f"--plan {arguments.plan}: has limits, not a baseline; only quick has one")
     for name in [arguments.kernel] if arguments.kernel else KERNELS:
         system = _system(_board(arguments), arguments.plan, name)
         file = gate.baseline(system.board, system.plan)

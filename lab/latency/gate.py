@@ -107,7 +107,7 @@ def check_control(found: Results) -> str:
         return f"{found.board}, {found.kernel}: refused, as it has to be, for {', '.join(later)}:\n  {refused}"
     raise UserError(
         f"{found.board}, {found.kernel}: the negative control passes: no wake-up is more than {TIMES} times as late as "
-        "that of the accepted run, so the measurement notices nothing"
+        "that of the baseline, so the measurement detects nothing"
     )
 
 

@@ -79,7 +79,7 @@ def describe(name: str, verdict: Verdict) -> str:
         f"{name}: {verdict.states} states in {verdict.groups} groups, {verdict.power_ons} power-ons, "
         f"{verdict.sampled} states by themselves: "
         f"{len(verdict.bricks)} bricks, {len(verdict.wrong)} wrong releases",
-        f"    states by what was started: {started}",
+        f"    states by the slot that started: {started}",
         *(f"    {fault}" for fault in faults),
     ]
     return "".join(f"{line}\n" for line in lines)

@@ -74,7 +74,7 @@ def with_link(link: str, directory: Path) -> Path:
     shutil.copytree(paths.INVENTORY, directory)
     file = directory / "group_vars/all.yml"
     text, count = re.subn(r"(?m)^(  link: ).*$", rf"\g<1>{link}", file.read_text())
-    assert count == 1, f"{file} has {count} lines that say network.link"
+    assert count == 1, f"{file} has {count} lines with network.link"
     file.write_text(text)
     return directory
 
@@ -134,7 +134,7 @@ def up(count: int, link: str | None = None) -> None:
             for number, _ in enumerate(process.stdout, 1):  # a line for each that has booted
                 step.at(number, count, "guests", *awaited[number : number + 1])
             if process.poll() is not None or not guest_ports():
-                raise UserError(f"the virtual fleet did not start; {paths.shown(_LOG)} says:\n{_LOG.read_text()}")
+                raise UserError(f"the virtual fleet did not start; {paths.shown(_LOG)} contains:\n{_LOG.read_text()}")
         except BaseException:
             process.terminate()
             raise

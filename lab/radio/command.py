@@ -19,7 +19,7 @@ _USUAL = ("b", "g")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--inventory", type=Path, default=PUBLISHED, help="fleet; by default the published one")
+    parser.add_argument("--inventory", type=Path, default=PUBLISHED, help="fleet; by default the four-robot demo fleet")
     parser.add_argument("--standard", help=f"{', '.join(phy.STANDARDS)}; by default {' and '.join(_USUAL)}")
     parser.add_argument("--rate", help="of frames to one station, such as 11M; by default the standard's highest")
     parser.add_argument("--area", default="10", help="side of the square on which robots stand, in m")

@@ -43,7 +43,7 @@ def how_long(flights: Sequence[Plan], kernels: Sequence[str]) -> str:
     seconds = sum(plan.seconds for plan in flights)
     minutes = math.ceil((virtual.BOOT_HOST_S + virtual.HOST_S * seconds) / 60)
     names = ", ".join(plan.name for plan in flights)
-    lines = [f"to fly: {names}; {seconds:g} virtual seconds, about {minutes} minutes on two cores"]
+    lines = [f"scenarios: {names}; {seconds:g} virtual seconds, about {minutes} minutes on two cores"]
     return "\n".join(lines + [kernel.how_long(kernels)] * bool(kernels))
 
 
@@ -57,10 +57,10 @@ def _fly(names: list[str], side_m: float, board: Board) -> None:
     there = {plan.name: plan for group in every for plan in group(side_m)}
     for name in chosen(names, there):
         if name not in there:
-            raise UserError(f"{name}: there is no such flight; there are {', '.join(there)}, and {ALL} for all")
+            raise UserError(f"{name}: there is no such scenario; there are {', '.join(there)}, and {ALL} for all")
     flown = _flown([there[name] for name in chosen(names, there)], board)
     page = report.write({there[name].title: flight for name, flight in flown.items()}, paths.BUILD / "reports")
-    print(f"{paths.shown(page)}; what each task said and recorded: {paths.shown(OUT)}/flights")
+    print(f"{paths.shown(page)}; logs and recordings of each task: {paths.shown(OUT)}/flights")
     faults = [
         f"{there[name].title}: {fault}"
         for name, flight in flown.items()
@@ -73,7 +73,7 @@ def _fly(names: list[str], side_m: float, board: Board) -> None:
 def _fly_guests(names: list[str], side_m: float, board: Board, link: str) -> None:
     there = {plan.name: plan for plan in plans(side_m) if plan.name in guests.FLIGHTS}
     if others := [name for name in chosen(names, there) if name not in there]:
-        raise UserError(f"{', '.join(others)}: guests fly {', '.join(there)}; all else is for virtual time")
+        raise UserError(f"{', '.join(others)}: guests run {', '.join(there)}; all else is for virtual time")
     shutil.rmtree(GUESTS, ignore_errors=True)
     to_fly = [there[name] for name in chosen(names, there)]
     flown = {plan.title: guests.fly(plan, GUESTS / plan.name, board, link) for plan in to_fly}
@@ -86,7 +86,7 @@ def _fly_lockstep(names: list[str], side_m: float, board: Board) -> None:
     there = {plan.name: plan for plan in every if plan.air_loss is not None}
     names = names or [lockstep.DEFAULT]
     if others := [name for name in chosen(names, there) if name not in there]:
-        raise UserError(f"{', '.join(others)}: guests in lock-step fly {', '.join(there)}, over the air")
+        raise UserError(f"{', '.join(others)}: guests in lock-step run {', '.join(there)}, over the air")
     to_fly = [there[name] for name in chosen(names, there)]
     shutil.rmtree(LOCKSTEP, ignore_errors=True)
     flown = {plan.title: lockstep.fly(plan, board, LOCKSTEP / plan.name) for plan in to_fly}
@@ -115,7 +115,7 @@ def crowds(most: int, board: Board) -> None:
 
 def accept(_: argparse.Namespace) -> None:
     gate.accept(gate.latencies(_flown(plans(TESTED_SIDE_M), _board(None))))
-    print(f"{paths.shown(gate.BASELINE)} has the hops of these flights; commit it")
+    print(f"{paths.shown(gate.BASELINE)} has the latencies of these scenarios; commit it")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

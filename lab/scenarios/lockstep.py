@@ -150,7 +150,7 @@ def fly(plan: Plan, board: Board, out: Path) -> Flight:
         for member, content in zip(fleet, contents, strict=True)
     }
     if errors := [f"{name}: {error}" for name, error in said.items() if error]:
-        raise UserError("the flight failed in a guest:\n" + "\n".join(errors))
+        raise UserError("the scenario failed in a guest:\n" + "\n".join(errors))
     return replace(Flight.read(flight), one_clock=False)
 
 

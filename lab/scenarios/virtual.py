@@ -374,7 +374,7 @@ def run(there: Mapping[str, bytes], board: Board, out: Path, flights: Mapping[st
         document = results.received(guest.run(out, _BOOT_LIMIT_S + _LIMIT_PER_SECOND * seconds))
     initrd.unlink()
     if error := unpack(document, out / "flights"):
-        raise UserError(f"the flight failed in the guest:\n{error}")
+        raise UserError(f"the scenario failed in the guest:\n{error}")
     return out / "flights"
 
 

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
             print(said(there, arguments.room), flush=True)
             while not ended.wait(_LOOK_S):
                 if gone := [one.robot.name for one in there.robots if not one.machine.running]:
-                    raise LabError(f"the guest of {gone[0]} ended; {paths.shown(live.DIRECTORY)} says more")
+                    raise LabError(f"the guest of {gone[0]} ended; its logs are in {paths.shown(live.DIRECTORY)}")
         except KeyboardInterrupt:
             sys.stderr.write("ended before they had started\n")
         except LabError as error:

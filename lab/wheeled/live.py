@@ -309,11 +309,11 @@ def robots(
     is touched.
     """
     if not 1 <= n <= min(MOST, len(starts)):
-        raise UserError(f"N={n}: a room has places for 1 to {min(MOST, len(starts))} robots")
+        raise UserError(f"N={n}: a world has places for 1 to {min(MOST, len(starts))} robots")
     walls = wheeled.ROOMS / f"{room}.yml"
     if not walls.exists():
         rooms = ", ".join(sorted(file.stem for file in wheeled.ROOMS.glob("*.yml")))
-        raise UserError(f"ROOM={room}: {paths.shown(walls)} is missing; rooms are {rooms}")
+        raise UserError(f"ROOM={room}: {paths.shown(walls)} is missing; worlds are {rooms}")
     with ExitStack() as stack:
         subnet = stack.enter_context(_loopback())
         fleet = write_inventory(directory / "inventory", n, inventory.load_fleet(INVENTORY).network.subnet)

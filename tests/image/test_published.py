@@ -137,7 +137,7 @@ def test_a_bundle_that_is_not_as_its_manifest_says_is_refused(
         members[member] = members[member][:-1] + b"!"
 
     wrong = altered(file, tmp_path / "wrong.bundle", change)
-    with pytest.raises(UserError, match=r"wrong\.bundle: holds something else than its manifest says; get it again"):
+    with pytest.raises(UserError, match=r"wrong\.bundle: does not match its manifest; get it again"):
         published.verify(releases, wrong)
 
 

@@ -104,7 +104,7 @@ def test_apps_of_the_inventory_are_on_the_card_and_come_back(bench: Bench, given
         found = sorted(line for line in done.repaired(robot) if line.startswith("app "))
         assert [line.startswith(words) for line, words in zip(found, expected, strict=True)] == [True] * 4, found
         (note,) = done.report["robots"][robot]["by_hand"]
-        assert note.startswith("app tried was brought by hand and stays; give it to the robot")
+        assert note.startswith("app tried was deployed manually and is kept; give it to the robot")
         assert "RUN=remove" in done.said
         assert there(bench) == (tried if more else versions | {"tried": tried["tried"]})
     units = [f"flotilla-app@{name}.service" for name in GIVEN]

@@ -105,7 +105,10 @@ def test_what_cannot_be_recorded_is_said(fleet: Path, tmp_path: Path) -> None:
     nowhere = {"KEYS": str(tmp_path / "nowhere")}
     with station(fleet, "record", tmp_path / "b.mcap", environment=nowhere) as process:
         complaints = process.communicate(timeout=PATIENCE)[1]
-    assert "nowhere/fleet_secret: is missing, so nothing proves what robots say; bring it from where" in complaints
+    assert (
+        "nowhere/fleet_secret: is missing, so reports of robots cannot be authenticated; bring it from where"
+        in complaints
+    )
     assert not (tmp_path / "nowhere").exists(), "a new secret would be no robot's"
     with station(paths.INVENTORY, "record", tmp_path / "b.mcap") as process:
         assert "no control task sends to a station" in process.communicate(timeout=PATIENCE)[1]

@@ -218,7 +218,7 @@ def test_the_report() -> None:
 
 
 SAID = {
-    "host key": (255, "Host key verification failed.", "refused, because its host key is not the one of"),
+    "host key": (255, "Host key verification failed.", "rejected, because its host key is not the one of"),
     "away": (255, "connect to host 10.42.0.3 port 22: No route to host", "did not answer: connect to host"),
     "broken": (255, "", "did not answer: the connection broke; is it on and reachable? `make ssh ROBOT=3`"),
     "refusal": (3, "/data has 12 KiB left\n", "robot3: /data has 12 KiB left"),
@@ -242,7 +242,7 @@ def test_words_of_a_remote_compiler_are_shown_and_kept(tmp_path: Path, capsys: p
     script.chmod(0o755)
     sent, made = tmp_path / "sent", tmp_path / "made"
     sent.write_text("sources")
-    with pytest.raises(UserError, match=r"robot3: it does not compile; what it said is above and in .*log"):
+    with pytest.raises(UserError, match=r"robot3: it does not compile; its output is above and in .*log"):
         remote.Connection(ROBOT, [str(script)]).stream("compile", "hover", stdin=sent, stdout=made, log=log)
     assert made.read_text() == "sources"
     assert log.read_text() == capsys.readouterr().err == "a.c:1: error\nit does not compile\n"

@@ -108,8 +108,8 @@ def test_a_silent_holder_is_dropped(bench: Bench) -> None:
     assert len(bench.sent) == count
     assert bench.motions()[-1] == AHEAD.resting
     state = bench.driving.state(ROVER)
-    assert (state.holder, state.sending, state.note) == (None, None, "Anna said nothing for 5 s and commands no more")
-    with pytest.raises(Refused, match="nobody commands it: Anna said nothing for 5 s"):
+    assert (state.holder, state.sending, state.note) == (None, None, "Anna was silent for 5 s and lost control")
+    with pytest.raises(Refused, match="nobody commands it: Anna was silent for 5 s"):
         bench.driving.drive(ROVER, ANNA.id, 0.3, 0, 0, True)
     bench.driving.take(ROVER, BEN)
 

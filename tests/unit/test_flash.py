@@ -285,7 +285,7 @@ def test_the_word_goes_past_the_fixed_disk_only(image: Path, host: MadeUpHost, k
 def test_everything_wrong_is_said_at_once(image: Path, host: MadeUpHost) -> None:
     host.mount("8:17", "/mnt", "x")
     attribute("ro", "1")(host)
-    with pytest.raises(UserError, match=r"(?s)Generic Reader.*was refused, nothing was written:.*/mnt.*read-only"):
+    with pytest.raises(UserError, match=r"(?s)Generic Reader.*was rejected, nothing was written:.*/mnt.*read-only"):
         to_card(image, host)
 
 
@@ -414,7 +414,7 @@ def flip(path: Path) -> None:
         ("robot3.img", remove, "robot3.img is missing; `make image ROBOT=3`"),
         ("robot3.bmap", remove, "robot3.bmap is missing; `make image ROBOT=3`"),
         ("robot3.bmap", lambda path: path.write_text("?"), "robot3.bmap: damaged block map"),
-        ("robot3.img", grow, f"has {SIZE + 1} bytes, its block map says {SIZE}; `make image ROBOT=3`"),
+        ("robot3.img", grow, f"has {SIZE + 1} bytes, its block map has {SIZE}; `make image ROBOT=3`"),
         ("robot3.img", flip, "does not match its block map at blocks 10 to 309 .*; `make image ROBOT=3`"),
     ],
 )

@@ -243,7 +243,7 @@ BROKEN: dict[str, tuple[str, str, str, list[tuple[str, str]]]] = {
     "mode": (f"{APP}/hover", "mode", "is not as built: hover has mode 644 and owner 0", INSTALL),
     "more": (f"{APP}/more", "another", "is not as built: more does not belong to it", INSTALL),
     "all gone": (APP, "gone", "is missing", INSTALL),
-    "drop-in": (f"etc/systemd/system/{SERVICE}.d", "gone", "lacks its unit.d", INSTALL),
+    "drop-in": (f"etc/systemd/system/{SERVICE}.d", "gone", "does not have its unit.d", INSTALL),
     "not kept": (WANTS, "gone", "does not start with the robot", [("hover", "keep")]),
 }
 
@@ -280,7 +280,7 @@ def test_a_new_version_is_told_from_one_that_was_brought_by_hand(
     assert fault == f"app hover is version {hover.version}, and the inventory's is {newer.version}"
     (tmp_path / "robot/etc/flotilla/apps/hover").write_text("version 1111111111111111\n")
     verdict = judge(4, state(robot, [newer]), [newer])
-    assert f"is version {hover.version}, brought by hand, and the inventory's is {newer.version}" in verdict.faults[0]
+    assert f"is version {hover.version}, deployed manually, and the inventory's is {newer.version}" in verdict.faults[0]
     assert verdict.actions == INSTALL
 
 

@@ -93,7 +93,7 @@ def test_a_computer_that_refuses_something_is_named_with_the_reason(monkeypatch:
     monkeypatch.setattr(container, "inside", list)
     monkeypatch.setattr(container, "NEEDED", {"wheels": "echo there are none >&2; exit 1"})
     with pytest.raises(
-        UserError, match="robots in containers need wheels, which this computer refuses: there are none"
+        UserError, match="robots in containers need wheels, which this computer does not permit: there are none"
     ):
         container.check()
 

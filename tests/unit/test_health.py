@@ -39,7 +39,7 @@ def tasks(steps: int = 100, overruns: int = 0, **flags: bool) -> dict[str, Any]:
         (tasks(gyro=False), Health(required_sensors=["other.gyro"]), []),
         (tasks(laser=True), GYRO, ["heading has no sensor gyro; it has laser"]),
         (tasks(), GYRO, ["heading has no sensor gyro; it has none"]),
-        ({UNIT: {"status": {"problem": "it sleeps"}}}, Health(), ["heading does not say how it does: it sleeps"]),
+        ({UNIT: {"status": {"problem": "it sleeps"}}}, Health(), ["heading does not report its status: it sleeps"]),
         ({UNIT: {"status": None}}, GYRO, []),
     ],
 )

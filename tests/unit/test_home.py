@@ -23,7 +23,7 @@ BOARD = "x86_64"
 
 
 def flotilla(*words: str, where: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """What the command line answers in a directory, with no variable of this test's own environment."""
+    """The answer of the command line in a directory, with no variable of this test's own environment."""
     kept = {name: value for name, value in os.environ.items() if name not in ("FLEET", "BUILD", "KEYS", "APPS")}
     return subprocess.run(
         [sys.executable, "-m", "flotilla", *words], cwd=where, capture_output=True, text=True, check=False,

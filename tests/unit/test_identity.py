@@ -162,7 +162,7 @@ def test_a_robot_that_stands_by_is_sent_to_and_listened_to() -> None:
         assert "withhold" not in rendered(transport, "control", {})["to_mapping"]["in"]
         assert rendered(transport, "control", {})["to_mapping"]["in"]["sequence"] == "state.sequence"
         assert "sequence" not in rendered(transport, "sensors", {})["to_navigation"]["in"]
-    with pytest.raises(UserError, match=r"navigation: no robot can stand by for it, and robot4 does"):
+    with pytest.raises(UserError, match=r"navigation: no robot can be its hot standby, and robot4 is"):
         rendered("udp", "control", {"robot4": "navigation"})
 
 

@@ -312,7 +312,7 @@ CASES = {
         "robots:\n  children:\n    board_smartcoret3:",
         "robots: {hosts: {robot1: , robot2: , robot3: }}\ncomputers:\n  children:\n    board_smartcoret3:",
         "robot4",
-        "board_smartcoret3, which robots lacks…robots' children",
+        "board_smartcoret3, which is not below robots…robots' children",
     ),
     "robot and station": Case(
         ROBOTS, "    station:\n", "    robot4:\n    station:\n", "robot4", "robot and station…one of the groups"

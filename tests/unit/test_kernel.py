@@ -113,7 +113,7 @@ def test_contradiction_names_both_places() -> None:
     with pytest.raises(ProblemsError) as caught:
         kernel.merge([first, second])
     assert str(caught.value) == (
-        "kernel/fragments/b.config:7: CONFIG_SMP: n: contradicts kernel/fragments/a.config:1, which says y; "
+        "kernel/fragments/b.config:7: CONFIG_SMP: n: contradicts kernel/fragments/a.config:1, which has y; "
         "keep one of them"
     )
 
@@ -144,9 +144,9 @@ def test_misspelt_option() -> None:
 @pytest.mark.parametrize(
     ("name", "config", "message"),
     [
-        ("PREEMPT_RT", "", "is refused by kconfig, which makes it n; it depends on EXPERT && ARCH_SUPPORTS_RT"),
-        ("E100", "CONFIG_E100=m\n", "is refused by kconfig, which makes it m; it depends on PCI"),
-        ("SERIAL_8250", "", "is refused by kconfig, which makes it n; another option selects or forbids it"),
+        ("PREEMPT_RT", "", "is changed by kconfig to n; it depends on EXPERT && ARCH_SUPPORTS_RT"),
+        ("E100", "CONFIG_E100=m\n", "is changed by kconfig to m; it depends on PCI"),
+        ("SERIAL_8250", "", "is changed by kconfig to n; another option selects or forbids it"),
     ],
 )
 def test_refused_option(name: str, config: str, message: str) -> None:

@@ -28,5 +28,5 @@ def test_overruns_before_the_flight_are_not_its(ago_s: float | None, overruns: i
 def test_flights_of_one_guest_are_refused() -> None:
     parser = argparse.ArgumentParser()
     command.arguments(parser)
-    with pytest.raises(UserError, match=r"strangers: guests in lock-step fly air, air-1, .* over the air"):
+    with pytest.raises(UserError, match=r"strangers: guests in lock-step run air, air-1, .* over the air"):
         command.run(parser.parse_args(["--lockstep", "strangers"]))

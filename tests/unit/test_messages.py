@@ -98,7 +98,7 @@ CASES = {
     ),
     "report without a name": Case("control-report:\n  s", "control-:\n  s", "control-", "not named after", "control-"),
     "standby of a report": Case(
-        "rate_hz: 10\n", "rate_hz: 10\n  standby: true\n", "control-report.standby", "tell robots apart…remove", "true",
+        "rate_hz: 10\n", "rate_hz: 10\n  standby: true\n", "control-report.standby", "distinguish robots", "true",
     ),
     "charge of a message between tasks": Case(
         "  standby: true", "  charge: good", "wrench.charge", "thruster-mapping has no use…stations", "charge",
@@ -136,7 +136,7 @@ CASES = {
     ),
     "no unit": Case(", unit: rad/s", "", "sensors.signals.rate.unit", 'missing…m/s; "1" for a double', "rate:"),
     "units": Case(
-        "[m, m, rad, m/s, m/s, rad/s]", "[m, rad]", "state.signals.state.unit", "2 units of 6 elements", "state:"
+        "[m, m, rad, m/s, m/s, rad/s]", "[m, rad]", "state.signals.state.unit", "2 units for 6 elements", "state:"
     ),
     "names alike": Case(
         "    gyro: {", "    gy_ro: { type: boolean }\n    gyro: {", "sensors.signals.gyro",
@@ -280,8 +280,8 @@ def in_task(tasks: Path, name: str, old: str, new: str) -> None:
         ("control", 'message("wrench").layout', 'message("wrnch").layout', "wrnch: is not in …did you mean wrench"),
         ("control", 'message("state").receive', 'message("valves").receive', "valves: valves receives it, and control"),
         ("control", 'message("wrench").send', 'message("state").send', "state: navigation sends it, and control wants"),
-        ("control", "period: 10 ms", "period: 20 ms", "period: 20 ms: with it wrench comes 50 …says 100; "),
-        ("control", "period: 10 ms", "period: 0.02s", "control-report comes 5 times a …messages.yml says 10;"),
+        ("control", "period: 10 ms", "period: 20 ms", "period: 20 ms: with it wrench comes 50 …has 100; "),
+        ("control", "period: 10 ms", "period: 0.02s", "control-report comes 5 times a …messages.yml has 10;"),
     ],
 )  # fmt: skip
 def test_a_task_that_uses_a_message_wrongly(task: str, old: str, new: str, words: str, tasks: Path) -> None:

@@ -177,7 +177,7 @@ _CAUSES: dict[str, tuple[str, dict[str, str | None], list[str]]] = {
     "a container": (
         "unshare: unshare failed: Operation not permitted",
         {".dockerenv": ""},
-        ["this container refuses them; start it with `docker run --security-opt seccomp=unconfined "],
+        ["this container forbids them; start it with `docker run --security-opt seccomp=unconfined "],
     ),
     "unknown": ("unshare: unshare failed: Operation not permitted", {}, ["build on a computer, or in a virtual "]),
 }  # fmt: skip

@@ -244,7 +244,7 @@ def test_robots_refuse_who_is_revoked(fleet: Fleet, tmp_path: Path, alice: Path)
     until = "until 2026-12-26 12:30 UTC"
     assert operators.table().splitlines() == [f"alice  {until}  revoked", f"bob    {until}"]
     with pytest.raises(
-        UserError, match=r"alice\.pub: this key was revoked, and robots refuse it; alice needs a new one"
+        UserError, match=r"alice\.pub: this key was revoked, and robots reject it; alice needs a new one"
     ):
         admit(fleet, "alice", alice)
     other = key(tmp_path, "other")

@@ -146,8 +146,8 @@ def test_json(fleet: Fleet) -> None:
             "robot1: flotilla-slot: both state blocks are unreadable",
         ),
         ("exit 3", "robot1: flotilla-slot: status 3"),
-        ("echo hello", "robot1: says something else than the state of its slots (Invalid JSON"),
-        ("echo '{}'", "robot1: says something else than the state of its slots (running: Field required)"),
+        ("echo hello", "robot1: does not report the state of its slots (Invalid JSON"),
+        ("echo '{}'", "robot1: does not report the state of its slots (running: Field required)"),
     ],
 )
 def test_why_a_robot_has_no_release(fleet: Fleet, script: str, said: str) -> None:

@@ -168,7 +168,7 @@ def test_a_task_that_somebody_took_over_says_nothing_of_others(robot: Path, line
             assert answer.tasks["sensors"].status == TaskStatus(0.01, 7, 0, {"gyro": False})
             assert answer.tasks["valves"] == State("running 100 s", True)
             (note,) = answer.notes
-            assert note.startswith("valves does not say how it does: its status is none: ")
+            assert note.startswith("valves does not report its status: the answer is invalid: ")
             assert note.isprintable()
 
 
@@ -229,7 +229,7 @@ def test_what_the_firewall_dropped(robot: Path, packets: int, said: tuple[str, .
 
 
 @pytest.mark.parametrize(
-    ("valid", "said"), [(7, ("clock refused 2 answers that were not a time server's",)), (9, ())], ids=["liar", "none"]
+    ("valid", "said"), [(7, ("clock rejected 2 answers that were not a time server's",)), (9, ())], ids=["liar", "none"]
 )
 def test_what_told_a_wrong_time(robot: Path, valid: int, said: tuple[str, ...]) -> None:
     """As chronyc 4.3 says it of two servers. Seen to fail with the first one's counts alone."""
@@ -272,7 +272,7 @@ def test_one_that_does_not_answer(robot: Path) -> None:
 def test_one_that_talks_nonsense(robot: Path, said: str) -> None:
     """Seen to hang without a limit to what is read."""
     say(robot, said)
-    with pytest.raises(UserError, match=r"^robot3: nobody understands"):
+    with pytest.raises(UserError, match=r"^robot3: its report of its tasks is invalid"):
         next(ask(ROBOT))
 
 

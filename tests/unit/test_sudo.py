@@ -70,7 +70,7 @@ def run(
 
 @pytest.mark.parametrize(("fails", "keys_of"), [(False, CALLER), (True, 0)])
 def test_who_called_sudo_gets_the_files_back(tmp_path: Path, fails: bool, keys_of: int) -> None:
-    """Seen to fail: all of these files stayed root's. However the command ends. What lies elsewhere stays root's, and
+    """Seen to fail: all of these files stayed root's. However the command ends. Files elsewhere stay root's, and
     so do keys in a directory that is root's on purpose."""
     status, owners, _ = run(tmp_path, needs_root=True, fails=fails, keys_of=keys_of)
     assert status == fails
@@ -96,7 +96,7 @@ _MAKE = 'chown -R "$2" "$1"; cd "$1"; shift 2; exec env SUDO_UID=1000 make -n "$
 
 
 def test_make_refuses_sudo_before_it_makes_anything(tmp_path: Path) -> None:
-    """Seen to fail: `make image` set the virtual environment up, and went on."""
+    """Seen to fail: `make image` set the virtual environment up, and continued."""
     checkout = tmp_path / "checkout"
     checkout.mkdir()
     for each in ("Makefile", "pyproject.toml", "images", "requirements"):

@@ -81,6 +81,6 @@ def test_nobody_without_the_key_tells_the_time(
     assert found["right"][1] >= time_server.ENOUGH
     monkeypatch.setattr(ssh, "command", lambda _: robot.shell.command)
     with closing(services.ask(robot.robot.model_copy(update={"control_tasks": ["any"]}))) as answers:
-        said = [re.fullmatch(r"clock refused (\d+) answers that .*", note) for note in next(answers).notes]
+        said = [re.fullmatch(r"clock rejected (\d+) answers that .*", note) for note in next(answers).notes]
     (refused,) = filter(None, said)
     assert int(refused[1]) >= found["none"][0] + found["wrong"][0]
