@@ -66,7 +66,7 @@ class Make(_Description):
     """`true`: the program uses sd_notify(3). It sends READY=1 when it is ready, and systemd ends it after a second
     without WATCHDOG=1."""
     io_ports: bool = False
-    """`true`: the program drives I/O ports (ioperm(2)). Not needed where `safe.yml` has a block that does."""
+    """`true`: the program drives I/O ports (ioperm(2)). Not needed if `safe.yml` has a block that drives them."""
 
 
 class Ert(_Description):
@@ -77,8 +77,8 @@ class Ert(_Description):
     model: Identifier
     """Name of the model."""
     sample_times: list[float] = []
-    """Sample times of the model's step functions in seconds, fastest first. Needed where comments in the code lack
-    them."""
+    """Sample times of the model's step functions in seconds, fastest first. Needed if comments in the code do not
+    contain them."""
     tasking: Literal["threads", "single"] | None = None
     """How a model with several rates runs. `threads`: each slower rate in a thread of lower priority, which it may
     need all of its period for. `single`: all in one thread, within the fastest period. When left out: threads where

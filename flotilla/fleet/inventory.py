@@ -392,7 +392,7 @@ def _description(groups: _Groups, sources: Sources) -> tuple[dict[str, Any], lis
             member |= {key: variables[key] for key in _OF_ROBOTS if key in variables}
             member["board"] = own[0].removeprefix("board_") if own else ""
         raw[kind][host] = member
-        if len(own) == 1:  # of several boards Ansible has merged one
+        if len(own) == 1:  # a host in several board groups has one merged `board`
             raw["boards"].setdefault(member["board"], variables.get("board"))
     for group in sources.boards():
         raw["boards"].setdefault(group.removeprefix("board_"), sources.described(group))

@@ -237,7 +237,7 @@ class Qemu(_Model):
     system: Literal["i386", "x86_64"]
     """Emulator: `qemu-system-SYSTEM`."""
     machine: Word
-    """Argument of `-machine`. It has a version, so that a newer QEMU shows the guest the same machine."""
+    """Argument of `-machine`. It has a version, so that a newer QEMU simulates the same machine."""
     cpu: Word
     """Argument of `-cpu`."""
     memory_mib: Annotated[Integer, between(64, 65536, unit="MiB")]
@@ -252,25 +252,25 @@ class Qemu(_Model):
 
 
 class Acceptance(_Model):
-    """What `make accept` asks of a computer of this kind. No card image depends on it."""
+    """Limits of `make accept` for a computer of this kind. Card images do not depend on them."""
 
     memory_mib: Annotated[Integer, between(16, 65536, unit="MiB")] = 64
-    """At least so much, as the kernel counts it: a few per cent less than what is plugged in."""
+    """Minimum of memory, as the kernel counts it: a few per cent less than the size of the modules."""
     clock_source: Word = "tsc"
-    """What the kernel must read time from; others take microseconds."""
+    """Clock source that the kernel must use; to read others takes microseconds."""
     wake_up_us: Annotated[Integer, between(1, 1_000_000, unit="µs")] = 100
-    """The latest wake-up of a real-time thread, under every load of `make latency`, as one of two threads that
-    interrupt each other, and by a semaphore. 100 µs of jitter are what the published systems had."""
+    """Maximum wake-up latency of a real-time thread: under every load of `make latency`, as one of two threads that
+    interrupt each other, and by a semaphore."""
     byte_us: Annotated[Integer, between(1, 1_000_000, unit="µs")] = 1000
-    """The latest byte from a serial port's interrupt to the thread that waits for it, under every load."""
+    """Maximum latency of a byte from a serial port's interrupt to the thread that waits for it, under every load."""
     hardware_latency_us: Annotated[Integer, between(1, 1_000_000, unit="µs")] = 20
-    """The longest moment in which the hardware takes the processor away from the kernel (SMI)."""
+    """Maximum duration of an interruption of the kernel by the hardware (SMI)."""
     card_read_mb_s: Annotated[float, Strict(), between(0, 10_000, unit="MB/s")] = 2
-    """At least so fast from the card."""
+    """Minimum read rate of the card."""
     card_write_mb_s: Annotated[float, Strict(), between(0, 10_000, unit="MB/s")] = 0.5
-    """At least so fast to the card, until the last byte is there."""
+    """Minimum write rate of the card, including the final sync."""
     temperature_c: Annotated[Integer, between(20, 125, unit="°C")] = 85
-    """Of the hottest sensor, at most."""
+    """Maximum temperature of the hottest sensor."""
 
 
 def _by_tty(ports: dict[str, Port]) -> dict[str, Port]:
@@ -300,17 +300,16 @@ class Board(_Model):
     suite: Release = "bookworm"
     """Debian's name of the release that its packages are of: Debian 12 or 13. Debian 13 has no kernel for i386."""
     firmware: Literal["bios", "uefi"] = "bios"
-    """What starts the card. `bios`: the boot loader is in an MBR. `uefi`: it is a file in a system partition, and the
-    partition table a GPT."""
+    """Firmware that starts the card. `bios`: the boot loader is in an MBR. `uefi`: the boot loader is a file in a
+    system partition, and the partition table is a GPT."""
     processor: Processor | None = None
     """Processor for which programs that measure the board are compiled: a value of GCC's `-march`. Leave it out for
     the oldest one of the architecture."""
     processors: Annotated[Integer, between(1, 1024)] = 1
-    """How many processors the computer has, hyper-threads counted as the kernel does. The highest `cpu:` of a control
-    task is one less."""
+    """Number of processors, hyper-threads included. The highest `cpu:` of a control task is one less."""
     isolated_processors: list[Annotated[Integer, between(1, 1023)]] = []
-    """Processors for control tasks alone, those that name one by `cpu:`: nothing else is put there, interrupts neither.
-    The first processor, 0, is for all the rest."""
+    """Processors that run only control tasks with `cpu:`, without other programs and interrupts. The first processor,
+    0, runs all the rest."""
     kernel: Literal["debian", "lean"]
     """`debian`: Debian's real-time kernel. `lean`: the one that `make kernel` builds from `kernel/NAME.yml`."""
     kernel_arguments: list[Item]
@@ -335,9 +334,9 @@ class Board(_Model):
     """Hardware watchdog. The boot loader starts it, and systemd takes it over through its driver. The driver's source
     names the ports. Leave it out for a board without a watchdog, or with one that needs more than a byte."""
     qemu: Qemu
-    """The machine that stands in for the board in `make boot` and in tests."""
+    """The QEMU machine that simulates the board in `make boot` and in tests."""
     acceptance: Acceptance = Field(default=Acceptance(), exclude=True)
-    """What `make accept` asks of a computer of this kind."""
+    """Limits of `make accept` for a computer of this kind."""
 
     @property
     def system(self) -> System:
@@ -385,8 +384,8 @@ class Ibss(_Model):
     ]
     """Identifier of the cell, the same on every robot: without a fixed one the cell splits."""
     interface: Interface = "wlan0"
-    """Kernel name of the radio. It has the robot's address when `network.link` is `ibss`. It is here and not with the
-    board, because with `net.ifnames=0` the only radio of any board is `wlan0`."""
+    """Kernel name of the radio. It has the robot's address if `network.link` is `ibss`. The key is not in the board's
+    file, because with `net.ifnames=0` the only radio of any board is `wlan0`."""
 
 
 class Network(_Model):
@@ -398,13 +397,13 @@ class Network(_Model):
             lambda net: 8 <= net.prefixlen <= 30, "has no room or no end", "address/length, length 8 to 30, best 24"
         ),
     ]
-    """Subnet of all robots and stations, a private network (RFC 1918). Nothing routes it."""
+    """Subnet of all robots and stations: a private network (RFC 1918), not routed."""
     link: Literal["ethernet", "ibss"]
     """`ethernet`: the wired port, a cable or a radio bridge. `ibss`: an 802.11 adapter in ad hoc mode."""
     ibss: Ibss | None = None
     """The ad hoc cell. Required when `link` is `ibss`."""
     dds_domain: Annotated[Integer, between(0, 232, "beyond it the ports 7400 + 250 × domain … do not exist")]
-    """Domain of the fleet's DDS participants. Those of other domains do not see each other."""
+    """Domain of the fleet's DDS participants. Participants of different domains do not discover each other."""
     udp_ports: list[
         Annotated[
             str,
@@ -418,11 +417,11 @@ class Network(_Model):
     transport: Literal["udp", "dds"] = "udp"
     """Transport of messages between control tasks of several robots: UDP datagrams, or topics of Cyclone DDS."""
     dds_security: Annotated[bool, Strict()] = False
-    """`true`: control tasks prove by certificates who they are to others by DDS, and believe messages of others only
-    then. They need some seconds more to find each other."""
+    """`true`: control tasks authenticate each other by certificates in DDS, and accept only authenticated messages.
+    Discovery takes some seconds longer."""
     update_kbit_s: Annotated[Integer, between(10, 1_000_000, unit="kbit/s")] = 300
     """Rate at which a station sends an update to several robots at once, headers included. The default is 30 % of the
-    lowest rate of 802.11b, at which multicast goes: the rest is for control."""
+    lowest rate of 802.11b, which multicast uses; control can use the rest."""
 
 
 class Health(_Model):
@@ -441,14 +440,14 @@ class Health(_Model):
 
 
 class Releases(_Model):
-    """Who signs the releases that robots take."""
+    """Signers of the releases that robots accept."""
 
     keys: Annotated[list[str], Field(min_length=1, max_length=16)] = ["release"]
     """Each the name of a key that is kept beside the robots' keys and made when it is first needed, or a public SSH key
     with a name behind it, `ssh-ed25519 AAAA… alice`, whose private half is elsewhere. Robots go by the keys of the
     release that they run: a new key comes to them by a release that the old ones have signed."""
     signatures: Annotated[Integer, between(1, 16)] = 1
-    """How many of them must have signed a release: 2 of 3, for instance."""
+    """Number of these keys that must have signed a release: 2 of 3, for instance."""
 
     @model_validator(mode="after")
     def _enough(self) -> Releases:
@@ -463,10 +462,10 @@ class Device(_Model):
     port: str = ""
     """The connector's name in the board's `ports`. Give this, or `usb`."""
     usb: UsbIdentity = ""
-    """Who it is on USB, in whichever socket: vendor and product as `lsusb` shows them, `15d1:0000` for a Hokuyo URG.
-    Where a robot has several of a kind, also the serial number, `0403:6001/A9XYZ`."""
+    """Identifier of the device on USB, in any socket: vendor and product as `lsusb` shows them, `15d1:0000` for a
+    Hokuyo URG. If a robot has several of a kind, also the serial number, `0403:6001/A9XYZ`."""
     baud: Baud
-    """Bit rate, as the device's manual says."""
+    """Bit rate, from the device's manual."""
 
 
 class Can(_Model):
@@ -496,7 +495,7 @@ class Robot(Host):
     """A robot: a host of a group `board_NAME`."""
 
     number: Annotated[Integer, between(1, 250)]
-    """Number that commands take, each once: `make image ROBOT=5`."""
+    """Number of the robot in commands, each once: `make image ROBOT=5`."""
     board: str
     """Name of the board, a key of `Fleet.boards`."""
     devices: dict[DeviceName, Device] = {}
@@ -507,10 +506,10 @@ class Robot(Host):
     control_tasks: list[TaskName] = []
     """Control tasks that start with the robot: `heading` is `ansible/control_tasks/heading.yml`."""
     standby: list[TaskName] = []
-    """Those of `control_tasks` that are hot standbys here: receivers use their messages while another robot with the
-    task is silent."""
+    """Tasks of `control_tasks` that are hot standbys on this robot: receivers use their messages while another robot
+    with the task is silent."""
     apps: list[AppName] = []
-    """Apps that the robot's card brings and that start with it: `hover` is the directory `apps/hover`."""
+    """Apps on the robot's card that start with the robot: `hover` is the directory `apps/hover`."""
 
 
 STATIONS = "stations"
@@ -528,7 +527,7 @@ class Signal(_Model):
     """Number of elements."""
     unit: Annotated[list[Item], BeforeValidator(lambda unit: [unit] if isinstance(unit, str) else unit)] = []
     """Unit of all elements, or a list with one for each; `"1"` for a plain number. Required for `single` and `double`.
-    The name of an integer says its unit, such as `sensed_ns`."""
+    The name of an integer contains its unit, such as `sensed_ns`."""
 
 
 class Drawn(_Model):
@@ -567,10 +566,10 @@ class Message(_Model):
     charge: SignalName | None = None
     """Signal that is a battery's state of charge, 0 to 1. `make top` shows it."""
     attempts: list[SignalName] = []
-    """Signals that count what the sender refused: datagrams that nobody should have sent. `make top` and the station's
-    page name those that are not 0."""
+    """Signals that count datagrams which the sender of the message rejected, such as forged ones. `make top` and the
+    station's page show those that are not 0."""
     foxglove: dict[SignalName, Drawn] = {}
-    """What viewers draw of it, by name: `pose` of `control-report` becomes the topic `/robot3/control/report/pose`."""
+    """Messages for viewers, by name: `pose` of `control-report` becomes the topic `/robot3/control/report/pose`."""
     signals: dict[SignalName, Signal]
     """The values, in the order of their bytes."""
 
@@ -595,7 +594,7 @@ class Fleet(_Model):
     health: Health = Health()
     """Limits of the health check that ends a roll-out."""
     releases: Releases = Releases()
-    """Who signs the releases that robots take."""
+    """Signers of the releases that robots accept."""
     boards: dict[str, Board]
     """By name."""
     robots: dict[int, Robot]

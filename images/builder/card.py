@@ -67,7 +67,7 @@ class Layout(pydantic.BaseModel):
     layout: Annotated[
         Integer, between(1, 1000, "a number that rises with each change of the card that an update cannot make")
     ]
-    """Number of the layout. A robot takes updates for its own only."""
+    """Number of the layout. A robot accepts only updates with its own number."""
     slot_mib: Annotated[Integer, between(32, 16384, unit="MiB")]
     """Size of each of the two slots."""
     data_mib: Annotated[Integer, between(8, 16384, unit="MiB")]

@@ -54,7 +54,7 @@ class Recipe(pydantic.BaseModel):
     modules: bool = True
     """`false`: leave the modules out. The kernel itself is the same without them."""
     files: int = pydantic.Field(gt=0)
-    """About how many are compiled: by them a build shows how far it is."""
+    """Approximate number of compiled files, for the progress of a build."""
 
 
 @dataclass(frozen=True)

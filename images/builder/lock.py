@@ -52,7 +52,7 @@ class File(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     suite: Word
-    """Debian's name of the release that all packages are of but a board's."""
+    """Debian's name of the release of all packages except those of boards."""
     locks: dict[str, _Asked]
     """Locks of other things than boards, by name."""
 

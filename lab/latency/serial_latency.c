@@ -8,7 +8,7 @@
  * PERIOD_NS. Both threads are SCHED_FIFO, above the interrupt threads, with their memory locked.
  */
 #define _GNU_SOURCE
-#include <asm/termbits.h> /* the kernel's termios; that of the C library lacks nothing here, but not both fit */
+#include <asm/termbits.h> /* conflicts with <termios.h>, whose features are not needed */
 #include <errno.h>
 #include <fcntl.h>
 #include <pthread.h>

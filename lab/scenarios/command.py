@@ -14,7 +14,7 @@ from flotilla.fleet.model import Board
 from images.builder import kernel
 from lab.scenarios import crowd, gate, guests, lockstep, report, virtual
 from lab.scenarios.flight import Flight
-from lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, secured, standby
+from lab.scenarios.plans import TESTED_SIDE_M, disturbed, over_the_air, plans, secured, standby
 from lab.scenarios.virtual import Plan
 
 OUT = paths.BUILD / "scenarios"
@@ -125,7 +125,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=TESTED_SIDE_M,
         metavar="M",
-        help=f"of the square (%(default)s m; as published, {SIDE_M:g})",
+        help="side of the square (%(default)s m)",
     )
     parser.add_argument("--guests", action="store_true", help="in real time, by guests of the card images")
     parser.add_argument("--lockstep", action="store_true", help="in virtual time, a guest for each computer")

@@ -15,7 +15,7 @@
 #include <time.h>
 
 enum {
-    HUNG_PERIODS = 10, /* of the rate, and a second, after which a run hangs */
+    HUNG_PERIODS = 10, /* periods of the rate, plus 1 s, after which a run counts as hung */
     JOIN_S = 1,        /* at the end of the task; the service manager waits for two */
 };
 
