@@ -19,6 +19,8 @@ MOST_TASKS = 16
 """Control tasks of a robot: each has a user of its own, and users are in the root, which does not know the tasks."""
 USERS = {SHARED_USER: 901, "app": 902} | {f"{SHARED_USER}{number}": 910 + number for number in range(1, MOST_TASKS + 1)}
 """Numbers by name, which are fixed, because the data partition outlives releases."""
+UPDATE_USER, UPDATE_NUMBER = "update", 903
+"""Who reads what others send of an update; owns nothing else. `runtime/programs/flotilla_patch.c` has the number."""
 DEVICES = "/dev/robot/"
 """Where a robot's devices are, by their names in the inventory."""
 RUNTIME_NEEDS = Path(__file__).with_name("block_needs.json")

@@ -110,7 +110,7 @@ def key(board: Board, lock: Lock, tools_lock: Lock) -> str:
         runtime.name(board.system),
         debian_kernel.PACKER,
         board.model_dump_json(include={"disk_modules", "architecture", "console"}),
-        json.dumps(privileges.USERS),
+        json.dumps(privileges.USERS | {privileges.UPDATE_USER: privileges.UPDATE_NUMBER}),
         cache.digest_of(DATA, lists()),
         *(Path(__file__).parent / name for name in MADE_BY),
         Path(namespace.__file__),
@@ -365,8 +365,8 @@ def lay_overlay(target: Path) -> None:
 def _configure(stage: Stage, console: str) -> None:
     """Accounts, services, the console's log-in and mount points: what the overlay's files cannot say by themselves."""
     stage.in_target("groupadd", "--system", "realtime")
-    # Whom control tasks and apps run as.
-    for name, number in privileges.USERS.items():
+    # Whom control tasks, apps and what parses updates run as.
+    for name, number in [*privileges.USERS.items(), (privileges.UPDATE_USER, privileges.UPDATE_NUMBER)]:
         stage.in_target(
             "useradd", "--system", "--uid", str(number), "--user-group", "--no-create-home",
             "--home-dir", "/nonexistent", "--shell", "/usr/sbin/nologin", name,

@@ -5,16 +5,18 @@
 #define _GNU_SOURCE
 #include <errno.h>
 #include <fcntl.h>
+#include <grp.h>
 #include <inttypes.h>
 #include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/prctl.h>
 #include <unistd.h>
 
 static const char usage[] =
     "usage: flotilla-patch BASE <DELTA >RESULT\n"
-    "Apply a delta to BASE, a file or a block device, which is only read.\n"
+    "Apply a delta to BASE, a file or a block device, which is only read. Root gives up its privileges for that.\n"
     "\n"
     "  --help, --version\n"
     "\n"
@@ -24,6 +26,7 @@ enum {
     WINDOW = 1 << 18, /* bytes of the result at a time, as flotilla/updates/delta.py has it made */
     NEAR = 4,         /* addresses that were used last */
     SAME = 3,         /* × 256 addresses by their remainder */
+    USER = 903,       /* `update`, UPDATE_USER of flotilla/fleet/privileges.py */
 };
 
 enum { SOURCE = 1 };                /* of a window's indicator: it copies from BASE */
@@ -237,6 +240,14 @@ static int patch(FILE *in, int base)
     return good ? 0 : 3;
 }
 
+/* Once BASE is open, nothing needs root: become a user who owns no file. */
+static bool give_up_privileges(void)
+{
+    return prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0 &&
+           (geteuid() != 0 ||
+            (setgroups(0, NULL) == 0 && setresgid(USER, USER, USER) == 0 && setresuid(USER, USER, USER) == 0));
+}
+
 int main(int argc, char **argv)
 {
     if (argc == 2 && strcmp(argv[1], "--help") == 0) {
@@ -254,6 +265,10 @@ int main(int argc, char **argv)
     int base = open(argv[1], O_RDONLY | O_CLOEXEC);
     if (base < 0) {
         fprintf(stderr, "flotilla-patch: %s: %s\n", argv[1], strerror(errno));
+        return 1;
+    }
+    if (!give_up_privileges()) {
+        fprintf(stderr, "flotilla-patch: user %d: %s\n", USER, strerror(errno));
         return 1;
     }
     return patch(stdin, base);
