@@ -75,7 +75,7 @@ stop|restart)
     if [ "$1" = restart ] && [ -e {robot}/known/spool/addresses ]; then
         . {robot}/known/spool/addresses
         setsid {programs}/flotilla-receive --from="$STATION" --at="$ROBOT" --key={robot}/known/spool/key \\
-            {robot}/known/spool/description {robot}/known/spool/file </dev/null >/dev/null 2>&1 &
+            {robot}/known/spool/description {robot}/known/spool/in/file </dev/null >/dev/null 2>&1 &
         echo $! >{robot}/pid
     fi ;;
 esac
@@ -183,6 +183,8 @@ def cell(tmp_path: Path, flotilla_slot: Path, monkeypatch: pytest.MonkeyPatch) -
             program(place / "lib/update.py", UPDATE.format(python=sys.executable, program=source, robot=place))
             text = (paths.OVERLAY / "usr/lib/flotilla/receive").read_text()
             program(place / "lib/receive", text.replace("/data/update/spool", f"{place}/known/spool"))
+            program(place / "bin/chgrp", "#!/bin/sh\n")  # the user is the image's
+            program(place / "bin/install", '#!/bin/sh\nwhile [ $# -gt 1 ]; do shift; done\nmkdir -p -m 700 "$1"\n')
             program(place / "bin/systemctl", SYSTEMCTL.format(robot=place, programs=programs))
             argv = f'{flotilla_slot} --disk {place}/card --running A "$@"'
             program(place / "bin/flotilla-slot", f"#!/bin/sh\nexec {argv}\n")

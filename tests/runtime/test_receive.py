@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,11 +64,14 @@ def program(file: Path, text: str) -> None:
 
 @pytest.fixture
 def robot(tmp_path: Path) -> Robot:
-    robot = Robot(tmp_path, tmp_path / "spool")
+    robot = Robot(tmp_path, tmp_path / "update" / "spool")
     (tmp_path / "bin").mkdir()
     text = SCRIPT.read_text()
     assert text.count(SPOOL) == 2
     program(tmp_path / "receive", text.replace(SPOOL, str(robot.spool)))
+    # The user is the image's.
+    program(tmp_path / "bin" / "chgrp", f'#!/bin/sh\necho "$@" >>{tmp_path}/given\n')
+    program(tmp_path / "bin" / "install", '#!/bin/sh\nwhile [ $# -gt 1 ]; do shift; done\nmkdir -p -m 700 "$1"\n')
     program(tmp_path / "bin" / "systemctl", SYSTEMCTL.format(directory=tmp_path))
     robot.state("dead")
     robot.free(1 << 20)
@@ -79,32 +83,42 @@ def test_what_was_received_of_the_same_file_stays(robot: Robot) -> None:
     assert robot.begin(1) == ""
     assert robot.calls() == ["stop flotilla-receive"] * 2 + ["restart flotilla-receive"]
     assert (robot.spool / "key").read_text() == f"{'01' * 32}\n"
+    modes = {
+        each.name: stat.S_IMODE(each.stat().st_mode) for each in (robot.spool.parent, *robot.spool.parent.rglob("*"))
+    }
+    assert modes == {
+        "update": 0o711, "spool": 0o711, "in": 0o700, "addresses": 0o600, "description": 0o640, "key": 0o640
+    }  # fmt: skip
+    assert (robot.directory / "given").read_text().splitlines() == [
+        f"update {robot.spool}/{name}.new" for name in ("description", "key")
+    ]
     assert (robot.spool / "addresses").read_text() == "STATION=10.0.0.254\nROBOT=10.0.0.1\n"
-    (robot.spool / "file.part").touch()
+    (robot.spool / "in/file.part").touch()
     robot.state("running")
     robot.begin(1)
     assert robot.calls() == []
     robot.state("exited")
     robot.begin(1)
     assert robot.calls() == ["restart flotilla-receive"]
-    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description", "file.part", "key"]
+    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description", "in", "key"]
+    assert (robot.spool / "in/file.part").exists()
 
 
 def test_another_key_begins_anew_with_what_was_received(robot: Robot) -> None:
     """Seen to fail: the service went on with the former key, and took nothing any more."""
     robot.begin(1)
-    (robot.spool / "file.part").touch()
+    (robot.spool / "in/file.part").touch()
     robot.calls()
     robot.state("running")
     robot.begin(1, key=2)
     assert "stop flotilla-receive" in robot.calls()
     assert (robot.spool / "key").read_text() == f"{'02' * 32}\n"
-    assert (robot.spool / "file.part").exists()
+    assert (robot.spool / "in/file.part").exists()
 
 
 def test_what_is_not_what_it_should_be_is_discarded(robot: Robot) -> None:
     robot.begin(1)
-    (robot.spool / "file").touch()
+    (robot.spool / "in/file").touch()
     robot.calls()
     assert robot.receive("discard") == ""
     assert robot.calls() == ["restart flotilla-receive"]
@@ -121,9 +135,10 @@ def test_another_file_takes_the_place_of_one_that_was_not_ended(robot: Robot) ->
     """Seen to fail where what was received of it is kept, and counts as the other one's."""
     robot.begin(1)
     for name in ("file", "file.part", "file.repair"):
-        (robot.spool / name).touch()
+        (robot.spool / "in" / name).touch()
     robot.begin(2)
-    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description", "key"]
+    assert sorted(file.name for file in robot.spool.iterdir()) == ["addresses", "description", "in", "key"]
+    assert not any((robot.spool / "in").iterdir())
     assert "00000002" in (robot.spool / "description").read_text()
 
 
@@ -145,12 +160,19 @@ def test_the_end_names_a_file_that_is_whole(robot: Robot) -> None:
     assert robot.receive("end") == ""
     robot.begin(1)
     robot.calls()
-    (robot.spool / "file.part").touch()
+    (robot.spool / "in/file.part").touch()
     assert robot.receive("end") == ""
-    (robot.spool / "file.part").rename(robot.spool / "file")
-    assert robot.receive("end") == f"{robot.spool}/file\n"
+    (robot.spool / "in/file.part").rename(robot.spool / "in/file")
+    assert robot.receive("end") == f"{robot.spool}/in/file\n"
     assert robot.calls() == ["restart flotilla-receive"] * 2
     assert not (robot.spool / "addresses").exists()
+
+
+def test_a_link_in_the_place_of_the_file_is_none(robot: Robot) -> None:
+    """Whoever has taken over the receiver has root open no other file."""
+    robot.begin(1)
+    (robot.spool / "in/file").symlink_to("/etc/shadow")
+    assert robot.receive("end") == ""
 
 
 @pytest.mark.parametrize("arguments", [[], ["begin"], ["begin", "10.0.0.254"], ["start"]])

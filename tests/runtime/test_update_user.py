@@ -11,6 +11,7 @@ import pytest
 
 from flotilla.common import namespace, paths
 from flotilla.fleet import privileges
+from flotilla.updates import multicast
 
 _SEED = paths.PROJECT / "runtime/tests/fuzz/corpus/patch/add"
 _ASK = """
@@ -52,6 +53,61 @@ def test_who_cannot_give_up_privileges_reads_nothing(flotilla_run: Path, base: P
     done = subprocess.run(argv, input=_SEED.read_bytes(), capture_output=True, check=False, timeout=60)
     assert (done.returncode, done.stdout) == (1, b"")
     assert done.stderr.startswith(b"flotilla-patch: user 903: ")
+
+
+_RECEIVE = """
+set -eu
+tmp=$1 program=$2 python=$3
+printf 'root:x:0:0::/:/bin/sh\\nupdate:x:903:903::/:/bin/sh\\n' >$tmp/passwd
+printf 'root:x:0:\\nupdate:x:903:\\n' >$tmp/group
+mount --bind $tmp/passwd /etc/passwd
+mount --bind $tmp/group /etc/group
+mount -t tmpfs none /mnt
+ip link set lo up multicast on
+ip address add 10.0.0.1/24 dev lo
+ip address add 10.0.0.254/24 dev lo
+ip route add 239.0.0.0/8 dev lo
+PATH=$tmp/bin:$PATH sh $tmp/receive begin 10.0.0.254 10.0.0.1 <$tmp/order
+. /mnt/update/spool/addresses
+cp $program /mnt/flotilla-receive
+line=$(eval echo "$(cat $tmp/argv)")
+setpriv --reuid update --regid update --clear-groups --bounding-set=-all --no-new-privs $line >$tmp/said 2>&1 &
+$python -m flotilla.updates.multicast --at 10.0.0.254 --key $tmp/key --rate 3000000 $tmp/content 10.0.0.1
+wait $! || true
+cat $tmp/said
+cmp $tmp/content "$(PATH=$tmp/bin:$PATH sh $tmp/receive end)"
+stat -c '%U %a' /mnt/update/spool/in/file
+"""
+
+
+def test_a_file_is_received_without_privileges(flotilla_run: Path, tmp_path: Path) -> None:
+    """By the script, the command line and the user of the service, in another place. Seen to fail with folders that the
+    user may not enter."""
+    spool = "/data/update/spool"
+    script = (paths.OVERLAY / "usr/lib/flotilla/receive").read_text()
+    service = (paths.OVERLAY / "usr/lib/systemd/system/flotilla-receive.service").read_text()
+    assert "\nUser=update\n" in service
+    assert "\nCapabilityBoundingSet=\n" in service
+    (argv,) = re.findall(r"^ExecStart=/usr/bin(.*)$", service, re.MULTILINE)
+    content = b"a release" * 20000
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/systemctl").write_text("#!/bin/sh\n")
+    (tmp_path / "bin/systemctl").chmod(0o755)
+    key = bytes(range(multicast.KEY_BYTES))
+    there = "/mnt/update/spool"
+    for name, text in {
+        "receive": script.replace(spool, there), "argv": "/mnt" + argv.replace(spool, there),
+        "order": multicast.order(key, multicast.describe(content)), "key": key.hex(),
+    }.items():  # fmt: skip
+        (tmp_path / name).write_text(text)
+    (tmp_path / "content").write_bytes(content)
+    program = flotilla_run.with_name("flotilla-receive")
+    done = subprocess.run(
+        [*namespace.prefix("--net", "--mount-proc"), "sh", "-c", _RECEIVE, "sh", tmp_path, program, sys.executable],
+        cwd=paths.PROJECT, capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.splitlines()[1:] == ["whole", "update 600"]
 
 
 def test_the_number_is_the_images() -> None:

@@ -242,7 +242,7 @@ def test_the_readme_has_the_tutorials_figures() -> None:
     assert len({tuple(re.findall(r"downloads about \d+ MB", page)) for page in shown}) == 1
 
 
-USERS = {"root", "nobody", "robot", *privileges.USERS}
+USERS = {"root", "nobody", "robot", privileges.UPDATE_USER, *privileges.USERS}
 
 
 @pytest.mark.parametrize("document", documents())

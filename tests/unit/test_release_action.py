@@ -9,7 +9,7 @@ import pytest
 
 from flotilla.common import paths
 
-FILE = "/data/update/spool/file"
+FILE = "/data/update/spool/in/file"
 
 
 @pytest.fixture
