@@ -39,6 +39,8 @@ ERROR = re.compile(r"(^|[\s:])(fatal )?error:|undefined reference to|\*\*\* \[")
 """What compilers, linkers and make write in a line that says why they failed."""
 _TAIL = 30
 """Lines of a log that an error shows."""
+_LOG_BYTES = 4 << 20
+"""Of the beginning of a log, and of its end, where errors are looked for."""
 
 
 def missing_capabilities(status: str) -> list[str]:
@@ -220,8 +222,18 @@ def run_logged(title: str, argv: Sequence[str], log: Path, environment: Mapping[
         finally:
             process.kill()
     if status != 0:
-        said = telling(log.read_text(errors="replace"))
+        said = telling(log_text(log))
         raise UserError(f"{title} failed (status {status}); the end of {paths.shown(log)}:\n{said}")
+
+
+def log_text(log: Path) -> str:
+    """A log; of a long one, which somebody's build may write without end, the beginning and the end."""
+    with log.open("rb") as file:
+        head = file.read(_LOG_BYTES)
+        left = file.seek(0, os.SEEK_END) - len(head)
+        file.seek(-min(left, _LOG_BYTES), os.SEEK_END)
+        tail = file.read(_LOG_BYTES)
+    return (head + (b"\n" if left > _LOG_BYTES else b"") + tail).decode(errors="replace")
 
 
 def telling(text: str) -> str:

@@ -105,6 +105,8 @@ def compile_plugin(
     return compile_shared(source, own, system, ["-std=c11", *common, *options], run, foreign, theirs)
 
 
+MOST_BYTES = 64 << 20
+"""Of a plug-in: it is read into memory, and a file of holes would take all of it."""
 _OURS = re.compile(r'^[ \t]*#[ \t]*include[ \t]*[<"]flotilla/', re.MULTILINE)
 
 
@@ -140,6 +142,8 @@ def compile_shared(
         made = work / "plugin.so"
         if made.is_symlink() or not made.is_file():
             raise UserError(f"{made.name}: the compiler was to make this file and did not")
+        if made.stat().st_size > MOST_BYTES:
+            raise UserError(f"{made.name}: has {made.stat().st_size} bytes, a plug-in has at most {MOST_BYTES}")
         return made.read_bytes()
 
 

@@ -24,6 +24,8 @@ from flotilla.common.errors import UserError
 from flotilla.fleet.model import Fleet
 from flotilla.robot import fetch, ssh
 from flotilla.station import mcap_reader
+from images.builder import runtime
+from images.builder.lock import HOST
 from tests.unit.test_station_admission import page
 
 __all__ = ["page"]
@@ -134,3 +136,17 @@ def test_the_address_gives_no_other_cookie_than_the_token(page: tuple[int, str])
             answer = connection.getresponse()
             answer.read()
             assert (answer.status, answer.getheader("Set-Cookie")) == (200, cookie)
+
+
+def test_a_plugin_of_holes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen to fail: it was read into memory. The sandbox lets a compiler write files of 4 GiB."""
+
+    def make(work: Path, *_: object) -> None:
+        with (work / "plugin.so").open("wb") as made:
+            made.truncate(runtime.MOST_BYTES + 1)
+
+    monkeypatch.setattr(runtime, "command", make)
+    monkeypatch.setattr(paths, "BUILD", tmp_path)
+    (tmp_path / "a.c").write_text("int a;\n")
+    with pytest.raises(UserError, match=rf"plugin\.so: has {runtime.MOST_BYTES + 1} bytes, a plug-in has at most"):
+        runtime.compile_shared(tmp_path / "a.c", ["a.c"], HOST, [])

@@ -220,6 +220,26 @@ def test_errors_are_shown_though_many_warnings_follow() -> None:
     assert namespace.telling("\n".join(log[:20])).splitlines() == log[:20]
 
 
+@pytest.mark.parametrize("size", [0, 10, namespace._LOG_BYTES, namespace._LOG_BYTES + 5, 2 * namespace._LOG_BYTES])
+def test_a_log_is_read_once_as_it_is(tmp_path: Path, size: int) -> None:
+    content = (b"0123456789" * (size // 10 + 1))[:size]
+    (tmp_path / "log").write_bytes(content)
+    assert namespace.log_text(tmp_path / "log").encode() == content
+
+
+def test_a_log_without_end_takes_little_memory(tmp_path: Path) -> None:
+    """Seen to fail: a MemoryError, because all of it was read."""
+    with (tmp_path / "log").open("wb") as log:
+        log.write(b"a.c:1:1: error: unknown type name 'wheel'\n")
+        log.seek(1 << 40)
+        log.write(b"\nmake: *** [all] Error 1\n")
+    text = namespace.log_text(tmp_path / "log")
+    assert len(text) <= 2 * namespace._LOG_BYTES + 1
+    said = namespace.telling(text).splitlines()
+    assert said[0].endswith("unknown type name 'wheel'")
+    assert said[-1] == "make: *** [all] Error 1"
+
+
 CHECK = """
 from flotilla.common import namespace
 from flotilla.common.errors import UserError
