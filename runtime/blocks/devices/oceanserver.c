@@ -83,15 +83,80 @@ enum {
 
 enum stage { WAKING, ASKED, STREAMING };
 
-struct parser {
-    struct record record;
-    uint8_t stage;
+/* What is read of a battery. All but the charge, which some controllers leave out, must be there. */
+enum { TEMPERATURE, VOLTAGE, CURRENT, CHARGE, REGISTERS };
+static const uint8_t registers[REGISTERS] = {
+    [TEMPERATURE] = OCEANSERVER_B_TEMPERATURE,
+    [VOLTAGE] = OCEANSERVER_B_VOLTAGE,
+    [CURRENT] = OCEANSERVER_B_CURRENT,
+    [CHARGE] = OCEANSERVER_B_CHARGE,
 };
 
-static bool feed(void *parser, uint8_t byte, void *sample)
+static const struct {
+    uint8_t number, output;
+} masks[] = {
+    {OCEANSERVER_C_PRESENT, OUT_PRESENT}, /* the first one */
+    {OCEANSERVER_C_CHARGING, OUT_CHARGING},
+    {OCEANSERVER_C_DISCHARGING, OUT_DISCHARGING},
+    {OCEANSERVER_C_EXTERNAL_POWER, OUT_EXTERNAL_POWER},
+    {OCEANSERVER_C_POWER_NOT_GOOD, OUT_POWER_NOT_GOOD},
+    {OCEANSERVER_C_INHIBITED, OUT_INHIBITED},
+};
+enum { MASKS = sizeof masks / sizeof masks[0] };
+
+struct value {
+    int64_t at_ns; /* when it arrived; 0: it has not */
+    uint16_t raw;
+};
+
+/* The newest of each value: a record has only a part of them, and a whole round of records comes in a burst. */
+struct values {
+    struct value minutes, percent, masks[MASKS], registers[OCEANSERVER_BATTERIES][REGISTERS];
+};
+
+struct parser {
+    struct record record;
+    struct values values; /* since the port was opened */
+    uint8_t stage;
+    uint8_t controller; /* the one to read */
+};
+
+static void keep(struct value *value, const struct oceanserver_sample *sample, uint8_t number, int64_t now_ns)
+{
+    uint16_t raw;
+    if (oceanserver_value(sample, number, &raw))
+        *value = (struct value){now_ns, raw};
+}
+
+static void gather(struct parser *self, const struct oceanserver_sample *sample)
+{
+    const int64_t now_ns = fl_now_ns();
+    struct values *values = &self->values;
+    uint16_t raw;
+    if (sample->kind == OCEANSERVER_SYSTEM) {
+        if (oceanserver_value(sample, OCEANSERVER_S_MINUTES, &raw) &&
+            oceanserver_value(sample, OCEANSERVER_S_CHARGE, &raw)) {
+            keep(&values->minutes, sample, OCEANSERVER_S_MINUTES, now_ns);
+            keep(&values->percent, sample, OCEANSERVER_S_CHARGE, now_ns);
+        }
+    } else if (sample->controller == self->controller && sample->kind == OCEANSERVER_CONTROLLER) {
+        for (size_t i = 0; i < MASKS; i++)
+            keep(&values->masks[i], sample, masks[i].number, now_ns);
+    } else if (sample->controller == self->controller && sample->battery - 1u < OCEANSERVER_BATTERIES) {
+        for (size_t i = 0; i < REGISTERS; i++)
+            keep(&values->registers[sample->battery - 1u][i], sample, registers[i], now_ns);
+    }
+}
+
+static bool feed(void *parser, uint8_t byte, void *newest)
 {
     struct parser *self = parser;
-    bool complete = oceanserver_feed(&self->record, byte, sample);
+    struct oceanserver_sample sample;
+    bool complete = oceanserver_feed(&self->record, byte, &sample);
+    if (complete) {
+        gather(self, &sample);
+        *(struct values *)newest = self->values;
+    }
     /* Before the stream was started, this is the last record that was on the wire when the menu was called up. */
     if (complete && self->stage == ASKED)
         self->stage = STREAMING;
@@ -101,8 +166,8 @@ static bool feed(void *parser, uint8_t byte, void *sample)
 static size_t converse(void *parser, const void *given, int silent_ms, uint8_t *out, size_t size)
 {
     struct parser *self = parser;
-    (void)given;
     (void)size;
+    self->controller = (uint8_t)((const struct oceanserver *)given)->controller;
     if (silent_ms == FL_SERIAL_OPENED || (self->stage != WAKING && silent_ms > LOST_MS)) {
         self->stage = WAKING;
         *out = ' ';
@@ -122,11 +187,9 @@ static const char *reason(void *parser, const void *given)
     return record_reason(&((struct parser *)parser)->record);
 }
 
-/* All records are needed, because each has only a part; a whole round of them comes in a burst. */
 static const struct fl_serial_protocol protocol = {
     .parser_size = sizeof(struct parser),
-    .sample_size = sizeof(struct oceanserver_sample),
-    .records = 64,
+    .sample_size = sizeof(struct values),
     .feed = feed,
     .send = converse,
     .reason = reason,
@@ -134,14 +197,10 @@ static const struct fl_serial_protocol protocol = {
 
 /* --- the block --- */
 
-/* What is read of a battery. All but the charge, which some controllers leave out, must be there. */
-enum { TEMPERATURE, VOLTAGE, CURRENT, CHARGE, REGISTERS };
-
 struct state {
     struct fl_serial *serial;
     struct fl_sensor sensor;
-    /* When each part arrived. The age is that of the oldest part: usually one battery fails first. */
-    int64_t system_ns, controller_ns, registers_ns[OCEANSERVER_BATTERIES][REGISTERS];
+    struct values values; /* also of before the port was opened */
 };
 
 static int start(struct fl_block *block)
@@ -158,61 +217,45 @@ static int initialize(struct fl_block *block)
     return FL_OK;
 }
 
-static void take_system(struct fl_block *block, const struct oceanserver_sample *sample, int64_t arrived_ns)
+/* Whether a value arrived, ever. */
+static bool take(struct value *value, const struct value *newest)
 {
-    uint16_t minutes, percent;
-    if (!oceanserver_value(sample, OCEANSERVER_S_MINUTES, &minutes) ||
-        !oceanserver_value(sample, OCEANSERVER_S_CHARGE, &percent))
-        return;
-    FL_OUT(block, OUT_REMAINING, double) = minutes * 60.0;
-    FL_OUT(block, OUT_CHARGE, double) = percent / 100.0;
-    ((struct state *)block->state)->system_ns = arrived_ns;
+    if (newest->at_ns)
+        *value = *newest;
+    return value->at_ns;
 }
 
-static void take_controller(struct fl_block *block, const struct oceanserver_sample *sample, int64_t arrived_ns)
+static void take_battery(struct fl_block *block, struct state *state, const struct values *newest, unsigned battery)
 {
     static const struct {
-        uint8_t number, output;
-    } masks[] = {
-        {OCEANSERVER_C_PRESENT, OUT_PRESENT},
-        {OCEANSERVER_C_CHARGING, OUT_CHARGING},
-        {OCEANSERVER_C_DISCHARGING, OUT_DISCHARGING},
-        {OCEANSERVER_C_EXTERNAL_POWER, OUT_EXTERNAL_POWER},
-        {OCEANSERVER_C_POWER_NOT_GOOD, OUT_POWER_NOT_GOOD},
-        {OCEANSERVER_C_INHIBITED, OUT_INHIBITED},
+        uint8_t output;
+        double parts; /* of the unit */
+    } scales[REGISTERS] = {
+        [TEMPERATURE] = {OUT_TEMPERATURE, 10},
+        [VOLTAGE] = {OUT_VOLTAGE, 1000},
+        [CURRENT] = {OUT_CURRENT, 1000},
+        [CHARGE] = {OUT_CHARGES, 100},
     };
-    uint16_t mask;
-    for (size_t i = 0; i < sizeof masks / sizeof masks[0]; i++)
-        if (oceanserver_value(sample, masks[i].number, &mask))
-            FL_OUT(block, masks[i].output, uint8_t) = (uint8_t)mask;
-    if (oceanserver_value(sample, OCEANSERVER_C_PRESENT, &mask))
-        ((struct state *)block->state)->controller_ns = arrived_ns;
+    for (size_t i = 0; i < REGISTERS; i++) {
+        struct value *value = &state->values.registers[battery][i];
+        if (take(value, &newest->registers[battery][i]))
+            ((double *)block->out[scales[i].output])[battery] =
+                (i == CURRENT ? (int16_t)value->raw : value->raw) / scales[i].parts;
+    }
 }
 
-/* A battery's registers come in several records, those of interest but for the charge in one. */
-static void take_battery(struct fl_block *block, const struct oceanserver_sample *sample, int64_t arrived_ns)
+static void take_all(struct fl_block *block, struct state *state, const struct values *newest)
 {
-    uint16_t value;
-    unsigned battery = sample->battery - 1u;
-    if (battery >= OCEANSERVER_BATTERIES)
-        return;
-    int64_t *arrived = ((struct state *)block->state)->registers_ns[battery];
-    if (oceanserver_value(sample, OCEANSERVER_B_TEMPERATURE, &value)) {
-        ((double *)block->out[OUT_TEMPERATURE])[battery] = value / 10.0;
-        arrived[TEMPERATURE] = arrived_ns;
-    }
-    if (oceanserver_value(sample, OCEANSERVER_B_VOLTAGE, &value)) {
-        ((double *)block->out[OUT_VOLTAGE])[battery] = value / 1000.0;
-        arrived[VOLTAGE] = arrived_ns;
-    }
-    if (oceanserver_value(sample, OCEANSERVER_B_CURRENT, &value)) {
-        ((double *)block->out[OUT_CURRENT])[battery] = (int16_t)value / 1000.0;
-        arrived[CURRENT] = arrived_ns;
-    }
-    if (oceanserver_value(sample, OCEANSERVER_B_CHARGE, &value)) {
-        ((double *)block->out[OUT_CHARGES])[battery] = value / 100.0;
-        arrived[CHARGE] = arrived_ns;
-    }
+    struct values *values = &state->values;
+    if (take(&values->minutes, &newest->minutes))
+        FL_OUT(block, OUT_REMAINING, double) = values->minutes.raw * 60.0;
+    if (take(&values->percent, &newest->percent))
+        FL_OUT(block, OUT_CHARGE, double) = values->percent.raw / 100.0;
+    for (size_t i = 0; i < MASKS; i++)
+        if (take(&values->masks[i], &newest->masks[i]))
+            FL_OUT(block, masks[i].output, uint8_t) = (uint8_t)values->masks[i].raw;
+    for (unsigned battery = 0; battery < OCEANSERVER_BATTERIES; battery++)
+        take_battery(block, state, newest, battery);
 }
 
 static int64_t earlier(int64_t one_ns, int64_t other_ns)
@@ -220,17 +263,19 @@ static int64_t earlier(int64_t one_ns, int64_t other_ns)
     return one_ns < other_ns ? one_ns : other_ns;
 }
 
-/* When the oldest part arrived; 0 while one is missing. Absent batteries are left out. */
+/* When the oldest part arrived, usually of the battery that fails first; 0 while one is missing. Absent batteries are
+ * left out. */
 static int64_t oldest(const struct fl_block *block)
 {
     const struct state *state = block->state;
-    int64_t oldest_ns = earlier(state->system_ns, state->controller_ns);
+    const struct values *values = &state->values;
+    int64_t oldest_ns = earlier(values->minutes.at_ns, values->masks[0].at_ns);
     for (unsigned battery = 0; battery < OCEANSERVER_BATTERIES; battery++) {
         if (!(FL_OUT(block, OUT_PRESENT, uint8_t) >> battery & 1))
             continue;
         for (unsigned part = 0; part < REGISTERS; part++)
-            if (part != CHARGE || state->registers_ns[battery][part])
-                oldest_ns = earlier(oldest_ns, state->registers_ns[battery][part]);
+            if (part != CHARGE || values->registers[battery][part].at_ns)
+                oldest_ns = earlier(oldest_ns, values->registers[battery][part].at_ns);
     }
     return oldest_ns;
 }
@@ -239,18 +284,11 @@ static int step(struct fl_block *block)
 {
     const struct oceanserver *oceanserver = block->parameters;
     struct state *state = block->state;
-    struct oceanserver_sample sample;
+    struct values newest;
     int64_t arrived_ns;
     uint32_t sequence;
-    while (fl_serial_next(state->serial, &sample, &arrived_ns, &sequence)) {
-        if (sample.kind == OCEANSERVER_SYSTEM)
-            take_system(block, &sample, arrived_ns);
-        else if (sample.controller != oceanserver->controller)
-            continue;
-        else if (sample.kind == OCEANSERVER_CONTROLLER)
-            take_controller(block, &sample, arrived_ns);
-        else
-            take_battery(block, &sample, arrived_ns);
+    if (fl_serial_newest(state->serial, &newest, &arrived_ns, &sequence)) {
+        take_all(block, state, &newest);
         int64_t oldest_ns = oldest(block);
         if (oldest_ns)
             fl_sensor_update(&state->sensor, oldest_ns, sequence);

@@ -4,6 +4,9 @@
 #include "said.h"
 #include "seccomp.h"
 
+#include <sched.h>
+#include <sys/ioctl.h>
+
 static const char *const vectors[] = {
     "$S,01,270F,02,00,04,60%21\r\n",
     "$C1,01,FF,02,00,03,FF,04,00,05,00,06,00,07,00%72\r\n",
@@ -227,6 +230,29 @@ static void is_good_when_all_parts_are_there(void **state)
     line_unplug(&line);
 }
 
+/* Steps that are far apart: what arrived last counts. Seen to fail: the first 64 records were kept. */
+static void gives_the_newest_after_many(void **state)
+{
+    (void)state;
+    enum { MANY = 99 };
+    struct line line;
+    char record[16];
+    struct fl_block *batteries = streaming(&line, "60");
+    for (int percent = 1; percent <= MANY; percent++) {
+        snprintf(record, sizeof record, "S,01,0001,04,%02X", (unsigned)percent);
+        line_say(&line, record_of(record));
+    }
+    int port = open(line.path, O_RDONLY | O_NOCTTY | O_CLOEXEC), waiting = 1;
+    while (waiting) { /* for the block's thread */
+        assert_int_equal(ioctl(port, FIONREAD, &waiting), 0);
+        sched_yield();
+    }
+    close(port);
+    STEP_UNTIL(batteries, GET(batteries, "charge", double) > (MANY - 0.5) / 100);
+    testbed_end(batteries);
+    line_unplug(&line);
+}
+
 /* The controller goes on talking, but one battery's values are old. */
 static void one_silent_part_is_enough_to_be_stale(void **state)
 {
@@ -338,6 +364,7 @@ int main(void)
         cmocka_unit_test(refuses_other_records),
         cmocka_unit_test(comes_back_after_garbage),
         cmocka_unit_test(is_good_when_all_parts_are_there),
+        cmocka_unit_test(gives_the_newest_after_many),
         cmocka_unit_test(one_silent_part_is_enough_to_be_stale),
         cmocka_unit_test(notices_unplugging_and_comes_back),
         cmocka_unit_test(a_collision_leaves_the_value_and_its_age),
