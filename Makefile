@@ -168,7 +168,7 @@ operators: | setup ## list the certificates: name, expiry, revocation
 backup-keys: | setup ## write all keys to one encrypted file | OUT=file [PASSWORD_FILE=file]
 	$(Q)$(FLOTILLA) backup-keys $(call need,OUT) $(call option,--password-file,PASSWORD_FILE)
 
-restore-keys: | setup ## restore all keys from such a file | FILE=file [PASSWORD_FILE=file]
+restore-keys: | setup ## restore all keys from an encrypted file | FILE=file [PASSWORD_FILE=file]
 	$(Q)$(FLOTILLA) restore-keys $(call need,FILE) $(call option,--password-file,PASSWORD_FILE)
 
 ##@ Quality

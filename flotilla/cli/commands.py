@@ -86,7 +86,7 @@ def _verify_bundle(arguments: argparse.Namespace) -> None:
 
 
 def _verify_bundle_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bundle", type=Path, help="what somebody published")
+    parser.add_argument("bundle", type=Path, help="bundle file of the publisher")
 
 
 def _size(arguments: argparse.Namespace) -> None:
@@ -266,7 +266,9 @@ def _admit_operator_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("name", help="of the person: small letters, digits and hyphens")
     parser.add_argument("key_file", type=Path, help="the person's public key")
-    parser.add_argument("--days", type=int, default=operators.DAYS, help="how long the certificate lasts (%(default)s)")
+    parser.add_argument(
+        "--days", type=int, default=operators.DAYS, help="days until the certificate expires (%(default)s)"
+    )
     parser.add_argument(
         "--from",
         dest="sources",
@@ -376,8 +378,10 @@ def _param_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
     parser.add_argument("task", help="which runs on the robot")
     parser.add_argument("parameter", nargs="?", help="block.parameter; all by default")
-    parser.add_argument("--confirm", metavar="OLD", help="what a limit of safety is now; else you are asked")
-    parser.add_argument("value", nargs="?", help="what to set it to; a negative one after --")
+    parser.add_argument(
+        "--confirm", metavar="OLD", help="present value of a safety limit; without it the command asks you"
+    )
+    parser.add_argument("value", nargs="?", help="new value; write a negative one after --")
 
 
 def _scope(arguments: argparse.Namespace) -> None:
@@ -437,7 +441,7 @@ def _import_model(arguments: argparse.Namespace) -> None:
 
 
 def _import_model_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, metavar="zip", help="what packNGo(buildInfo) made in MATLAB")
+    parser.add_argument("archive", type=Path, metavar="zip", help="archive of packNGo(buildInfo) in MATLAB")
     parser.add_argument("name", help="of the app, and of its directory in apps/")
     parser.add_argument("--model", help="its name, where the archive has several")
     parser.add_argument("--sample-times", type=_seconds, metavar="S,…", help="in seconds, fastest first, for a new app")
@@ -467,7 +471,7 @@ def _deploy(arguments: argparse.Namespace) -> None:
 def _deploy_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
     parser.add_argument("app", type=Path, help="the app's directory")
-    parser.add_argument("--run", help="start, stop, status, log or remove what is on the robot")
+    parser.add_argument("--run", help="start, stop, status, log or remove: act on the app on the robot")
     parser.add_argument("--keep", action="store_true", help="start it with the robot")
     parser.add_argument("--on-robot", action="store_true", help="compile it on the robot")
 
@@ -577,7 +581,7 @@ def _fetch(arguments: argparse.Namespace) -> None:
 
 def _fetch_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
-    parser.add_argument("task", help="or app, whose block recorder wrote them")
+    parser.add_argument("task", help="task or app with the block recorder")
     parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where to (build/recordings/ROBOT/TASK)")
 
 
@@ -626,7 +630,7 @@ def _provision_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--guests", action="store_true", help="the virtual fleet instead of the robots")
     parser.add_argument("--playbook", default="fleet", help="of ansible/ (%(default)s)")
     parser.add_argument(
-        "words", nargs="*", metavar="-- …", help="what ansible-playbook is given, too: -- --check --diff"
+        "words", nargs="*", metavar="-- …", help="further arguments of ansible-playbook: -- --check --diff"
     )
 
 
@@ -639,65 +643,67 @@ def _completion(arguments: argparse.Namespace) -> None:
 
 
 def _completion_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="which one")
+    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="name of the shell")
 
 
 COMMANDS = (
-    Command("Cards", "image", "make the card image of a robot, or of all", _image, _image_arguments),
+    Command("Cards", "image", "build the card image of one robot, or of all", _image, _image_arguments),
     Command("Cards", "flash", "write a card and read it back", _flash, _flash_arguments),
-    Command("Cards", "kernel", "build a kernel of our own as a Debian package", _kernel, _kernel_arguments),
-    Command("Cards", "verify", "build a second time in other circumstances and compare every byte", _verify,
+    Command("Cards", "kernel", "compile the lean PREEMPT_RT kernel as a Debian package", _kernel, _kernel_arguments),
+    Command("Cards", "verify", "build an image a second time and compare every byte", _verify,
             _verify_arguments),
-    Command("Cards", "verify-bundle", "build what a published bundle holds, and compare", _verify_bundle,
+    Command("Cards", "verify-bundle", "rebuild a published bundle and compare it", _verify_bundle,
             _verify_bundle_arguments),
-    Command("Cards", "size", "show the largest packages and files of a robot's image", _size, robot_argument),
-    Command("Cards", "bundle", "make the update bundle of a board", _bundle, _bundle_arguments),
-    Command("Cards", "bench", "measure builds against other builders", _bench, _bench_arguments),
-    Command("Inputs", "init", "make a home for a fleet of your own", _init, _init_arguments),
-    Command("Inputs", "check-fleet", "check the fleet's description", _check_fleet),
-    Command("Inputs", "lock", "resolve the package lists to exact versions", _lock, _lock_arguments),
+    Command("Cards", "size", "list the largest packages and files of an image", _size, robot_argument),
+    Command("Cards", "bundle", "build the update bundle of a board", _bundle, _bundle_arguments),
+    Command("Cards", "bench", "measure build times, also of other image builders", _bench, _bench_arguments),
+    Command("Inputs", "init", "make a directory for a fleet of your own", _init, _init_arguments),
+    Command("Inputs", "check-fleet", "validate the inventory", _check_fleet),
+    Command("Inputs", "lock", "resolve package lists to exact versions and hashes", _lock, _lock_arguments),
     Command("Inputs", "cve", "check the locks against Debian's security tracker", _cve, _cve_arguments),
-    Command("Keys", "rotate-key", "make a new host key of a robot, or a new operator's key", _rotate_key,
+    Command("Keys", "rotate-key", "replace the key of a robot or of the operator", _rotate_key,
             _rotate_key_arguments),
     Command("Keys", "revoke-key", "revoke the host key of a stolen robot", _revoke_key,
             robot_argument),
-    Command("Keys", "admit-operator", "sign a certificate that lets a person into all robots for some days",
+    Command("Keys", "admit-operator", "issue a certificate that lets a person into all robots",
             _admit_operator, _admit_operator_arguments),
     Command("Keys", "revoke-operator", "revoke a person's certificates", _revoke_operator, _revoke_operator_arguments),
-    Command("Keys", "operators", "show who has a certificate, and until when", _operators),
+    Command("Keys", "operators", "list the certificates: name, expiry, revocation", _operators),
     Command("Keys", "backup-keys", "write all keys to one encrypted file", _backup_keys, _key_backup_arguments),
-    Command("Keys", "restore-keys", "put them back", _restore_keys, _key_backup_arguments),
-    Command("Robots", "ssh", "open a shell on a robot, or on its guest when one runs", _ssh, robot_argument),
-    Command("Robots", "param", "read or set parameters of a running task or app", _param, _param_arguments),
-    Command("Robots", "scope", "print or record signals of a running task or app", _scope, _scope_arguments),
-    Command("Robots", "releases", "show which release each robot runs", _releases, _releases_arguments),
-    Command("Robots", "hwcheck", "report a robot's hardware", _hwcheck, _hwcheck_arguments),
+    Command("Keys", "restore-keys", "restore all keys from an encrypted file", _restore_keys, _key_backup_arguments),
+    Command("Robots", "ssh", "open a shell on a robot, or on its guest if one runs", _ssh, robot_argument),
+    Command("Robots", "param", "list or set the parameters of a running task or app", _param, _param_arguments),
+    Command("Robots", "scope", "show or record the signals of a running task", _scope, _scope_arguments),
+    Command("Robots", "releases", "list the release of each robot, and its trial state",
+            _releases, _releases_arguments),
+    Command("Robots", "hwcheck", "write a robot's hardware to a file for a bug report", _hwcheck, _hwcheck_arguments),
     Command("Robots", "provision", "apply the inventory to the robots", _provision, _provision_arguments),
-    Command("Robots", "station", "serve a page to see the fleet, drive and record it", _page, _page_arguments,
+    Command("Robots", "station", "serve a page that shows, drives and tunes the fleet", _page, _page_arguments,
             packages="station"),
-    Command("Robots", "record", "record what robots send to this computer", _station, _record_arguments,
+    Command("Robots", "record", "record telemetry to an MCAP file", _station, _record_arguments,
             packages="station"),
-    Command("Robots", "live", "serve it to Foxglove", _station, _live_arguments, packages="station"),
-    Command("Robots", "top", "show it as a table", _station, _top_arguments, packages="station"),
-    Command("Robots", "station-join", "put this computer's 802.11 adapter into the robots' cell", _station_join,
+    Command("Robots", "live", "stream live telemetry to Foxglove", _station, _live_arguments, packages="station"),
+    Command("Robots", "top", "show a live telemetry table; start and stop tasks by key",
+            _station, _top_arguments, packages="station"),
+    Command("Robots", "station-join", "join the robots' ad hoc cell with this computer's radio", _station_join,
             _station_join_arguments),
-    Command("Robots", "station-leave", "take it out, and put everything back", _station_leave,
+    Command("Robots", "station-leave", "leave the cell and restore the adapter's settings", _station_leave,
             _station_leave_arguments),
-    Command("Robots", "station-time", "write what this computer's chrony needs to lead the robots' time", _station_time,
+    Command("Robots", "station-time", "write the chrony files that make this computer the clock", _station_time,
             _station_time_arguments),
-    Command("Robots", "drive", "command a robot on wheels by keys or a gamepad", _drive, _drive_arguments,
+    Command("Robots", "drive", "drive a wheeled robot by keyboard or gamepad", _drive, _drive_arguments,
             packages="station"),
     Command("Robots", "positions", "forward indoor positions to a robot, authenticated", _positions,
             _positions_arguments, packages="station"),
-    Command("Robots", "fetch", "bring a robot's recorder files to this computer", _fetch, _fetch_arguments),
-    Command("Robots", "convert", "make MCAP, CSV or MAT of recordings", _convert, _convert_arguments,
+    Command("Robots", "fetch", "copy the recorder files of a robot's task", _fetch, _fetch_arguments),
+    Command("Robots", "convert", "convert recordings to MCAP, CSV or MAT", _convert, _convert_arguments,
             packages="station"),
-    Command("Robots", "report", "draw a recording: paths, latency, all signals", _report, _report_arguments,
+    Command("Robots", "report", "write a page of plots from recordings", _report, _report_arguments,
             packages="station"),
-    Command("Apps", "new-app", "make a working start of an app", _new_app, _new_app_arguments),
-    Command("Apps", "import-model", "make an app of MATLAB's packNGo archive, or renew its code", _import_model,
+    Command("Apps", "new-app", "create a working example app in apps/NAME", _new_app, _new_app_arguments),
+    Command("Apps", "import-model", "import MATLAB's packNGo archive as apps/NAME", _import_model,
             _import_model_arguments),
-    Command("Apps", "deploy", "build an app for a robot, send it there and run it", _deploy, _deploy_arguments),
-    Command("Shell", "completion", "print what makes a shell complete these words", _completion,
+    Command("Apps", "deploy", "build an app, copy it to a robot and start it", _deploy, _deploy_arguments),
+    Command("Shell", "completion", "print a completion script for a shell", _completion,
             _completion_arguments, packages="station"),
 )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -136,3 +137,17 @@ def test_a_broken_pipe_to_another_program_is_a_defect() -> None:
     done = subprocess.run(argv, cwd=paths.PROJECT, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr.endswith("BrokenPipeError\n")
+
+
+SEVERAL = {"image", "fleet"}
+"""Commands of which several targets of make are a part."""
+
+
+def test_a_command_has_the_summary_of_its_target() -> None:
+    """Seen to fail for 39 commands, such as `live`: "serve it to Foxglove"."""
+    makefile = (paths.PROJECT / "Makefile").read_text()
+    targets = dict(re.findall(r"^([a-z-]+):.*?## ([^|\n]*?)(?: \|.*)?$", makefile, re.MULTILINE))
+    shown = {command.name: command.help for command in command_line.commands()}
+    both = (set(shown) & set(targets)) - SEVERAL
+    assert len(both) > 40
+    assert {name: shown[name] for name in both} == {name: targets[name] for name in both}
