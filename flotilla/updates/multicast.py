@@ -98,12 +98,12 @@ def describe(content: bytes) -> str:
 
 
 def order(key: bytes, description: str) -> str:
-    """What `receive begin` reads on a robot."""
+    """Input of `receive begin` on a robot."""
     return f"key {key.hex()}\n{description}"
 
 
 def transfer_number(content: bytes) -> int:
-    """It is part of what the tags are of."""
+    """It is part of the authenticated bytes."""
     return zlib.crc32(content)
 
 
@@ -165,7 +165,7 @@ class Transfer:
         return self._tagged(_HEADER.pack(_END, 0))
 
     def answer(self, datagram: bytes, address: str) -> bytes | None:
-        """What follows the tag, where it is of the robot with this address."""
+        """The bytes after the tag, if the tag is of the robot with this address."""
         tag, content = datagram[:TAG], datagram[TAG:]
         return content if hmac.compare_digest(tag, self._tag(content + IPv4Address(address).packed)) else None
 

@@ -372,7 +372,7 @@ static unsigned get16(const uint8_t *from)
     return (unsigned)from[0] << 8 | from[1];
 }
 
-/* The tag of a datagram; an answer's is of the address of who gives it, too. */
+/* The tag of a datagram; an answer's tag also covers the address of its sender. */
 static void make_tag(const struct hmac_sha256_ctx *key, const struct transfer *transfer, const uint8_t *datagram,
                      size_t length, const struct in_addr *who, uint8_t tag[static TAG])
 {

@@ -172,7 +172,7 @@ def low_pass(random: Random) -> Draw:
 
 def wound(anti_windup: str, share: float, limit: float, growth: Array, others: Array) -> Array:
     """The integral in each step, all at once: the steps that are beyond a limit make the rest linear, and follow from
-    it. `growth`: by the error; `others`: the output's other parts; `share`: of what is beyond, led back in a step."""
+    it. `growth`: by the error; `others`: the output's other parts; `share`: of the excess, led back in a step."""
     beyond, before = np.zeros(len(growth)), np.full(len(growth), np.nan)
     while not np.array_equal(beyond, before):
         back = share * np.abs(beyond) if anti_windup == "back-calculation" else np.zeros(len(growth))

@@ -245,7 +245,7 @@ def test_who_has_not_the_key_changes_nothing(quiet: Cell) -> None:
 
 
 def test_an_answer_is_the_robots_that_has_the_key(quiet: Cell) -> None:
-    """The station believes no answer of somebody else, in the name of a robot that is silent."""
+    """The station accepts no answer of another computer, in the name of a robot that is silent."""
     sender = multicast.Sender(quiet.content, IPv4Address("127.0.0.1"), [IPv4Address(ROBOTS[0])], KEY)
     sender._ask()
     nothing = multicast._HEADER.pack(multicast._ANSWERED, sender._question) + multicast._ANSWER.pack(1, 0)

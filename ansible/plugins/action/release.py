@@ -181,8 +181,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
     def _take_received(self, shipment: dict[str, Any]) -> dict[str, Any] | None:
         """What the robot says after it took the file that it received; None where that is not whole.
 
-        Where the file is not what the release says, SSH brings what is missing, and nothing of it stays for a later
-        call.
+        If the file does not match the release, SSH sends the missing chunks, and nothing of the file is kept.
         """
         if not (self._task.args.get("listening") or {}).get("listens"):
             return None

@@ -1,4 +1,4 @@
-/* libFuzzer's entry for what flotilla-receive reads: a description and a key, or datagrams, by the lowest bit of the
+/* libFuzzer's entry for the input of flotilla-receive: a description and a key, or datagrams, by the lowest bit of the
  * first byte. Tags are right: a robot that was taken over has the key. Seen to find that a block's number was not
  * compared with the transfer's.
  *
