@@ -64,7 +64,7 @@ def test_connections_without_a_login_are_few(robot: RobotGuest) -> None:
     greeted = sh(robot, f"python3 - <<'END'\n{_KNOCK}END")
     assert greeted == str([True] * 5 + [False] * 2)
     settings = sh(robot, "sshd -T").splitlines()
-    assert {"logingracetime 30", "maxstartups 20:30:60", "persourcemaxstartups 5"} <= {*settings}
+    assert {"logingracetime 60", "maxstartups 20:30:60", "persourcemaxstartups 5"} <= {*settings}
 
 
 @pytest.fixture
