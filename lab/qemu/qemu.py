@@ -35,6 +35,8 @@ _DISKS = {
     "virtio": ["virtio-blk-pci,drive=card,bootindex=0"],
 }
 """Devices that attach the card, by `qemu.disk`."""
+NEVER_SAVED = {"nvme"}
+"""Those of them whose state QEMU cannot save."""
 
 _VIRTUAL_START = datetime(2026, 1, 1)
 

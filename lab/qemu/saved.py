@@ -49,7 +49,7 @@ def wait(guest: Guest, robot: Robot, shell: Ssh) -> None:
     await_login(guest, robot)
     shell.connect()
     shell.script("systemctl is-system-running --wait", check=False)
-    if not cache.has(_KIND, key := _key(guest)):
+    if guest.board.qemu.disk not in qemu.NEVER_SAVED and not cache.has(_KIND, key := _key(guest)):
         shell.hang_up()  # its connection would be a restored guest's too
         cache.result(_KIND, key, guest.save)
         shell.connect()

@@ -105,7 +105,7 @@ def test_what_was_received_of_the_same_file_stays(robot: Robot) -> None:
 
 
 def test_another_key_begins_anew_with_what_was_received(robot: Robot) -> None:
-    """Seen to fail: the service continued with the former key, and took nothing any more."""
+    """Otherwise the service would continue with the former key, and take no datagram any more."""
     robot.begin(1)
     (robot.spool / "in/file.part").touch()
     robot.calls()
