@@ -381,12 +381,12 @@ def test_the_default_flight_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> No
     there = {plan.name: plan for plan in plans(default.side)}
     chosen = [there[name] for name in scenarios.chosen(default.flights, there)]
     said = scenarios.how_long(chosen, [])
-    minutes = re.fullmatch(r"to fly: udp; 18 virtual seconds, about (\d+) minutes on two cores", said)
+    minutes = re.fullmatch(r"scenarios: udp; 18 virtual seconds, about (\d+) minutes on two cores", said)
     assert minutes
     assert int(minutes[1]) <= 5
     everything = [there[name] for name in scenarios.chosen([scenarios.ALL], there)]
     said = scenarios.how_long(everything, ["smartcoret3"])
-    assert said.startswith("to fly: udp, air, dds, loss,")
+    assert said.startswith("scenarios: udp, air, dds, loss,")
     assert "\nkernels to build first: smartcoret3, each about 7 minutes on two cores" in said
 
 
