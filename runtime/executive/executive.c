@@ -31,7 +31,7 @@ enum {
     CATCH_UP_PERIODS = 10, /* further behind, the remaining steps are skipped */
     HOLDER_MS = 1000,      /* wait for another process to release a device, when only making outputs safe */
     BURST_PERIODS = 2,     /* that a triggered task may be ahead of its mean rate */
-    CLOCKS_DIFFER = 1000,  /* the clocks of two computers differ by less than one part in so many */
+    FASTER = 20,           /* one part in so many, by which the mean rate may exceed the declared one: see `pay` */
     LATE_PERIODS = 5, /* from the end of a step to the end of the next: two for a late trigger, three for a late step */
     HUNG_PERIODS = 10, /* without a step, where no actuator time-out sets a limit */
 };
@@ -210,13 +210,13 @@ struct pace {
     int64_t expected_ns, soonest_ns;
 };
 
-/* A step is due at `release_ns`: pay a period for it, less what the clocks of two computers differ by, so that a sender
- * of the same rate is followed without delay. Periods without a step count for some time. */
+/* A step is due at `release_ns`: pay nearly a period for it. Periods without a step count for some time. An event that
+ * comes late costs a step more than its sender made, and until that is paid for, events of the sender's rate wait, up
+ * to a period: with a twentieth less than the period for each step, they are followed at once again after 20 steps. */
 static int64_t pay(struct executive *executive, struct pace *pace, int64_t release_ns)
 {
     const int64_t period_ns = executive->task->period_ns, least_ns = release_ns - BURST_PERIODS * period_ns;
-    pace->soonest_ns =
-        (pace->soonest_ns > least_ns ? pace->soonest_ns : least_ns) + period_ns - period_ns / CLOCKS_DIFFER;
+    pace->soonest_ns = (pace->soonest_ns > least_ns ? pace->soonest_ns : least_ns) + period_ns - period_ns / FASTER;
     return release_ns;
 }
 
