@@ -516,6 +516,7 @@ static int listen_to(struct listener *listener, struct transfer *transfer)
     return transfer->whole == transfer->count ? 0 : 3;
 }
 
+/* It is opened before blocks are read: datagrams that arrive meanwhile wait in it. */
 static bool open_socket(struct listener *listener, struct in_addr group, unsigned port)
 {
     static const int room = RECEIVE_BYTES, on = 1;
@@ -605,7 +606,6 @@ int main(int argc, char **argv)
         fail(argv[optind]);
         return 2;
     }
-    /* First the socket: what arrives while blocks are read waits in it. */
     if (!open_socket(&listener, group, (unsigned)port))
         return fail("socket");
     if (!open_files(&transfer) || !finish(&transfer))

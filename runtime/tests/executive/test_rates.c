@@ -268,8 +268,11 @@ static int last_words(void (*action)(struct fl_block *block), char *words, size_
         _exit(0);
     }
     close(ends[1]);
-    ssize_t length = read(ends[0], words, size - 1);
-    words[length > 0 ? length : 0] = '\0';
+    /* A line may be written in parts. */
+    size_t length = 0;
+    for (ssize_t part; (part = read(ends[0], words + length, size - 1 - length)) > 0;)
+        length += (size_t)part;
+    words[length] = '\0';
     close(ends[0]);
     waitpid(child, &status, 0);
     return WIFEXITED(status) ? WEXITSTATUS(status) : -1;
