@@ -24,16 +24,6 @@ def test_limits_of_control_programs(robot: RobotGuest) -> None:
     assert robot.shell.run(["chrt", "--fifo", "91", "true"], check=False).returncode != 0, "no limit is in force"
 
 
-def test_memory_is_reclaimed_before_a_send_has_to(robot: RobotGuest) -> None:
-    """From `low` on in the background; below `min`, whoever asks for memory reclaims some first."""
-    zones = sh(robot, "cat /proc/zoneinfo")
-    pages = {
-        name: sum(map(int, re.findall(rf"^ +{name} +(\d+)$", zones, re.MULTILINE)))
-        for name in ("min", "low", "managed")
-    }
-    assert pages["low"] - pages["min"] > 0.029 * pages["managed"] > 0
-
-
 def test_interrupt_threads_have_their_priorities(robot: RobotGuest, board: Board) -> None:
     table = [line.split() for line in sh(robot, "cat /etc/flotilla/irq-priorities").splitlines()]
     rules = [(line[0], line[1]) for line in table if line and not line[0].startswith("#")]
