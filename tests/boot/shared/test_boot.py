@@ -17,6 +17,7 @@ MEMORY_LIMIT_MB = {"i386": 40, "amd64": 70}
 PROCESSOR = {"pentium3": "Pentium III"}
 """What QEMU's processors call themselves, where that is not their name in QEMU."""
 HARMLESS = {
+    r"Module iTCO_wdt is blacklisted": "by the board x86_64: QEMU's computer has two watchdogs",
     r"irqpoll boot option not supported with PREEMPT_RT": "the board asks for it; only a kernel without RT obeys",
     r"ACPI: setting ELCR to [0-9a-f]{4} \(from [0-9a-f]{4}\)": "by acpi=noirq: ACPI's own interrupt becomes a level",
     r"tsc: Unable to calibrate against PIT": "QEMU's timers on a busy host",
