@@ -16,6 +16,7 @@ from pathlib import Path
 
 GROUP, PORT = "239.255.42.42", 4242
 HEADERS = 42
+TAG = 8
 LOST = 0x8000
 QUESTION = 0xFFFF
 ANSWER_S = 10.0
@@ -38,7 +39,7 @@ def main(tape: bytes, address: str, bit_s: int) -> list[str]:
         if not head & LOST:
             out.sendto(datagram, (GROUP, PORT))
         free_at = time.monotonic() + 8 * (HEADERS + length) / bit_s
-        if struct.unpack_from("!H", datagram, 4)[0] == QUESTION:
+        if struct.unpack_from("!H", datagram, TAG)[0] == QUESTION:
             try:
                 answers.append(out.recv(2048).hex())
             except TimeoutError:
