@@ -96,7 +96,7 @@ def test_apps_of_the_inventory_are_on_the_card_and_come_back(bench: Bench, given
         "app changed is not as built: unit.d/program.conf has another content",
         "app missing is missing",
         "app stopped does not run",
-        f"app whole is version {tried['whole']}, brought by hand, and the inventory's is {versions['whole']}",
+        f"app whole is version {tried['whole']}, deployed manually, and the inventory's is {versions['whole']}",
     ]
     for more, outcome in ((("--check", "--diff"), "would change"), ((), "changed")):
         done = play(bench, given, tmp_path, inventory, *more)

@@ -383,7 +383,7 @@ def test_a_board_that_is_another_one_is_refused(bench: Bench, fleet: Fleet) -> N
 
 
 def test_another_robots_card_is_refused(bench: Bench) -> None:
-    with bench.connection(3) as to, pytest.raises(UserError, match=r"robot3: refused, because its host key is not"):
+    with bench.connection(3) as to, pytest.raises(UserError, match=r"robot3: rejected, because its host key is not"):
         deploy.command(to, "other", "status")
 
 

@@ -561,7 +561,7 @@ BAD = {
         "2",
         "<CoSimulation ",
         '<CoSimulation needsExecutionTool="true" ',
-        "needsExecutionTool: true: asks for the",
+        "needsExecutionTool: true: needs the tool that made it",
     ),
     "no identifier": ("3", '"TwoLags"', '"Two lags"', "modelIdentifier: Two lags: is no identifier of C"),
     "no guid": ("2", " guid=", " other=", "guid: (nothing): is missing, so the code would not know its description"),
@@ -611,7 +611,7 @@ BAD_BUILD = {
         '"TwoLags" platform="x86-linux">',
         "BuildConfiguration: (nothing): none is of TwoLags for x86_64-linux",
     ),
-    "a library": ('"m"', '"hdf5"', "Library: hdf5: is a library that robots lack"),
+    "a library": ('"m"', '"hdf5"', "Library: hdf5: is a library that robots do not have"),
     "C++": ('"C99"', '"C++11"', "language: C++11: is not C; export the unit as C, or a binary"),
     "outside": (
         '"two_lags.c"',
