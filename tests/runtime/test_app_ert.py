@@ -139,7 +139,7 @@ def test_what_cannot_become_a_block_is_said(generated: Path, file: str, old: str
 def test_a_header_that_is_missing_is_named(generated: Path) -> None:
     """The coder leaves it in a folder of files that models share."""
     (generated / "rtwtypes.h").unlink()
-    said = r"generated/rtwtypes\.h is missing: it is part of the generated code, such as the files in slprj/ert/_sharedutils"
+    said = r"rtwtypes\.h is missing: it is part of the generated code, such as the files in slprj/ert/_sharedutils"
     with pytest.raises(UserError, match=said):
         read(generated)
 
