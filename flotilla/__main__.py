@@ -56,15 +56,19 @@ def _use_utf8() -> None:
 
 
 def _find_home() -> None:
-    """A command in a fleet's home, or below it, is about that fleet."""
-    if "FLEET" in os.environ:
+    """A command in a fleet's home, or below it, is about that fleet; one in the tool's checkout is not.
+
+    Only a home of this user's own, or of root: a file that somebody put into a common directory chooses nothing.
+    """
+    here, checkout = Path.cwd(), Path(__file__).resolve().parents[1]
+    if "FLEET" in os.environ or here.is_relative_to(checkout):
         return
-    here = Path.cwd()
     for directory in (here, *here.parents):
         file = directory / "fleet.yml"
         # A playbook may have this name, too.
         if file.is_file() and re.search(rb"(?m)^flotilla:", file.read_bytes()):
-            os.environ["FLEET"] = str(directory)
+            if {file.stat().st_uid, directory.stat().st_uid} <= {0, os.geteuid()}:
+                os.environ["FLEET"] = str(directory)
             return
 
 

@@ -39,7 +39,8 @@ _BOOT_LOADER = "grub-pc-bin"
 """Of the build tools: its code is on the card, before the first partition."""
 _DPKG_STATUS = "var/lib/dpkg/status"
 _ENTERING = (
-    "ansible/control_tasks", "ansible/inventory", "apps", "flotilla", "images", "kernel", "rootfs_overlay", "runtime",
+    "ansible/boards", "ansible/control_tasks", "ansible/inventory", "apps", "flotilla", "images", "kernel",
+    "rootfs_overlay", "runtime",
 )  # fmt: skip
 """Folders of the project whose files images are made of, or by."""
 _ENTERING_FROM_HOME = ("inventory", "control_tasks", "apps", "kernel", "overlay", "packages", "locks")

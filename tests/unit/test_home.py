@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 import yaml
 
+import flotilla.__main__ as program
 from flotilla.common import paths, sources
 from flotilla.fleet import home, identity
 from flotilla.fleet.model import Fleet
@@ -64,6 +65,36 @@ def test_a_playbook_of_the_same_name_is_no_home() -> None:
     """Seen to fail without the look into the file: FLEET= was the folder of the playbooks."""
     done = flotilla("check-fleet", where=paths.PROJECT / "ansible")
     assert done.stdout.startswith("flotilla: "), done.stderr
+
+
+def found(monkeypatch: pytest.MonkeyPatch, where: Path) -> str | None:
+    """The home that a command in a directory is about."""
+    monkeypatch.delenv("FLEET", raising=False)
+    monkeypatch.chdir(where)
+    program._find_home()
+    return os.environ.get("FLEET")
+
+
+def test_a_home_of_somebody_else_chooses_no_fleet(fleet_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as one in a common directory, above the one that a command runs in. Seen to fail without the comparison."""
+    (fleet_home / "mine").mkdir()
+    assert found(monkeypatch, fleet_home / "mine") == str(fleet_home)
+    if os.geteuid() == 0:
+        os.chown(fleet_home / "fleet.yml", 4242, 4242)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: 4242)
+    assert found(monkeypatch, fleet_home / "mine") is None
+
+
+def test_the_tools_checkout_inside_a_home_is_the_example_fleet(
+    fleet_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a submodule, for instance. Seen to fail: make in the checkout was about the home's robots."""
+    checkout = fleet_home / "flotilla"
+    checkout.mkdir()
+    monkeypatch.setattr(program, "__file__", str(checkout / "flotilla/__main__.py"))
+    assert found(monkeypatch, checkout) is None
+    assert found(monkeypatch, fleet_home) == str(fleet_home)
 
 
 def test_a_directory_that_is_no_home_is_refused(tmp_path: Path) -> None:
