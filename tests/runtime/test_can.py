@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -364,6 +365,12 @@ class CountingHub(UdpHub):
         super()._forward(raw, clients)
 
 
+@pytest.fixture
+def counting_hub() -> Iterator[CountingHub]:
+    with contextlib.closing(CountingHub()) as hub:
+        yield hub
+
+
 DRIVES = """
 period: 5 ms
 priority: 0
@@ -379,10 +386,15 @@ ONE_OF_DRIVES = """
 
 @pytest.mark.parametrize("drives", [1, 2, 3, 4])
 def test_one_sync_for_all_drives(
-    flotilla_run: Path, udp_can: Path, tmp_path: Path, drives: int, record_property: Callable[[str, object], None]
+    flotilla_run: Path,
+    udp_can: Path,
+    counting_hub: CountingHub,
+    tmp_path: Path,
+    drives: int,
+    record_property: Callable[[str, object], None],
 ) -> None:
     """Each has a command and three answers in a period: so the bus carries four PDOs for each drive, and one SYNC."""
-    hub = CountingHub()
+    hub = counting_hub
     server = Epos2Server(hub, *(Epos2(node) for node in range(1, drives + 1)))
     text = DRIVES + "".join(ONE_OF_DRIVES.format(node=node, master=120 + node) for node in range(1, drives + 1))
     watched = [f"drive{node}.{output}" for node in range(1, drives + 1) for output in ("enabled", "sequence")]
