@@ -146,6 +146,7 @@ requirements: | setup ## lock the Python packages again from requirements/*.in
 	$(Q)set -e; for each in $(all_inputs:.in=); do \
 	    $(locked) -c $(BUILD)/requirements.lock $$each.in -o $$each.lock; done
 	$(Q)$(subst --universal,--python-platform x86_64-manylinux_2_28,$(locked)) requirements/ros.in -o requirements/ros.lock
+	$(Q)$(locked) requirements/fuzz.in -o requirements/fuzz.lock
 
 ##@ Keys
 .PHONY: rotate-key revoke-key admit-operator revoke-operator operators backup-keys restore-keys
@@ -289,15 +290,21 @@ check-runtime: | setup-runtime $(VENV)/.tests ## check the C code: format, clang
 	$(Q)$(step) "clang-tidy" $(PYTHON) -m runtime.tidy $(BUILD)/runtime-sanitized
 	$(Q)$(step) "unit tests of C" env $(meson) test -C $(BUILD)/runtime-sanitized --no-rebuild --print-errorlogs --quiet
 
-fuzz: | setup-runtime ## fuzz the runtime's parsers with libFuzzer | [SECONDS=60] [SEED=1]
+fuzzed = -max_total_time=$(if $(value SECONDS),$(call given,SECONDS),60) $(if $(value SEED),-seed=$(call given,SEED)) \
+    -timeout=10 -verbosity=0
+fuzz: | setup-runtime setup-tests ## fuzz the parsers of robots and station with libFuzzer | [SECONDS=60] [SEED=1]
 	$(Q)images/install-host-packages tests/fuzz-packages.txt
 	$(Q)set -e; $(call configured,$(BUILD)/fuzz,CC=clang,-Dtests=true -Dfuzz=true -Dbuildtype=debugoptimized)
 	$(Q)$(call compile,$(BUILD)/fuzz,fuzzers)
 	$(Q)$(meson) test -C $(BUILD)/fuzz --suite fuzz --no-rebuild --print-errorlogs --quiet
-	$(Q)set -e; for known in runtime/tests/fuzz/corpus/*; do \
-	    name=$${known##*/}; found=$(BUILD)/found/$$name; \
+	$(Q)$(PYTHON) images/pip_settings.py $(VENV)/bin/uv pip install --quiet --python $(PYTHON) --require-hashes --no-deps \
+	    --target $(BUILD)/atheris -r requirements/fuzz.lock
+	$(Q)set -e; for known in runtime/tests/fuzz/corpus/* tests/fuzz/corpus/*; do \
+	    name=$${known##*/}; found=$(abspath $(BUILD))/found/$$name; \
+	    case $$known in runtime/*) run=$(BUILD)/fuzz/tests/fuzz/fuzz_$$name; most=1024;; \
+	        *) run="$(PYTHON) -m tests.fuzz $$name"; most=4096;; esac; \
 	    mkdir -p $$found; echo "$$name:" $(if $(value SECONDS),$(call given,SECONDS),60) s; \
-	    $(BUILD)/fuzz/tests/fuzz/fuzz_$$name -max_total_time=$(if $(value SECONDS),$(call given,SECONDS),60) $(if $(value SEED),-seed=$(call given,SEED)) -max_len=1024 -timeout=10 -verbosity=0 \
+	    PYTHONPATH=$(BUILD)/atheris $$run $(fuzzed) -max_len=$$most \
 	        -artifact_prefix=$$found- $$found $$known 2>$$found.log || { cat $$found.log >&2; exit 1; }; done
 
 bench-runtime: | setup-runtime runtime ## measure blocks' processor time, also of LinuxCNC's HAL | [SECONDS=2] [ROUNDS=5]

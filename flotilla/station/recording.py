@@ -19,6 +19,7 @@ MAGIC = b"FLOTREC1"
 PREFIX = struct.Struct("<8sII")
 CHECK = struct.Struct("<I")
 MOST_HEADER_BYTES = 1 << 24
+_MOST_RECORD_BYTES = 1 << 24
 _MOST_NS = 1 << 62
 CHUNK_BYTES = 1 << 20
 """Of a file in memory at once, about."""
@@ -115,6 +116,10 @@ class Recording:
     """This and `damaged`: as `Found` has them."""
 
 
+_NUMBERED = {("time_ns", "int64", 1), ("step", "uint64", 1)}
+"""Fields of every recording: name, type and width."""
+
+
 def dtype(kind: str) -> np.dtype[Any]:
     """Of an element of a signal, little-endian."""
     return np.dtype(CODES[kind]).newbyteorder("<")
@@ -135,14 +140,18 @@ def parse_header(data: bytes) -> Header:
         magic, bytes_of_header, bytes_of_record = PREFIX.unpack_from(data)
         if magic != MAGIC or bytes_of_header < PREFIX.size or bytes_of_record <= CHECK.size:
             raise ValueError("it does not begin as one")
+        if bytes_of_record > _MOST_RECORD_BYTES:
+            raise ValueError(f"its records have {bytes_of_record} bytes each, {_MOST_RECORD_BYTES} at most are read")
         if bytes_of_header > min(len(data), MOST_HEADER_BYTES):
             raise ValueError("it ends within its header")
         schema = json.loads(data[PREFIX.size : bytes_of_header])
         fields = tuple(Field(**field) for field in schema["fields"])
         for field in fields:
             _check_field(field, bytes_of_record)
-        if not {"time_ns", "step"} <= {field.name for field in fields} or len({f.name for f in fields}) < len(fields):
-            raise ValueError("it has no time_ns or step, or has a field twice")
+        if _NUMBERED - {(field.name, field.type, field.width) for field in fields}:
+            raise ValueError("it has no time_ns or step, or these are no whole numbers")
+        if len({field.name for field in fields}) < len(fields):
+            raise ValueError("it has a field twice")
         name, period_ns, wall_ns = str(schema["name"]), int(schema["period_ns"]), int(schema["wall_less_monotonic_ns"])
         if not 0 < period_ns < _MOST_NS or abs(wall_ns) >= _MOST_NS:
             raise ValueError("its times are none")

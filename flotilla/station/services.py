@@ -153,19 +153,25 @@ def ask(robot: Robot, shared: Sequence[str] = ()) -> Generator[Answer, None, Non
                 if line.rstrip() != _END and len(lines) < longest:
                     lines.append(line)
                     continue
-                try:
-                    *lines, cell, flood, clock, data = lines
-                    reports, odd = _reports(robot.control_tasks, lines[-len(units) :], before)
-                    before = _states(lines[: -len(units)], robot.control_tasks, reports)
-                    answer = Answer(before, (*odd, *_notes(cell.strip(), json.loads(flood), clock, data)))
-                except _NONSENSE as error:
-                    what = shown(repr(error)[:200])
-                    raise UserError(f"{robot.name}: its report of its tasks is invalid: {what}") from error
+                answer = read_round(robot, lines, before)
+                before = answer.tasks
                 yield answer
                 lines = []
             raise ssh.no_answer(robot, shown(process.stderr.read(_LONGEST).strip()) or "the connection broke")
         finally:
             process.kill()
+
+
+def read_round(robot: Robot, lines: Sequence[str], before: Mapping[str, State]) -> Answer:
+    """The answer in the lines of one round; `before`: the tasks of the round before. UserError if it is invalid."""
+    try:
+        *rest, cell, flood, clock, data = lines
+        units = len(robot.control_tasks)
+        reports, odd = _reports(robot.control_tasks, rest[len(rest) - units :], before)
+        tasks = _states(rest[: len(rest) - units], robot.control_tasks, reports)
+        return Answer(tasks, (*odd, *_notes(cell.strip(), json.loads(flood), clock, data)))
+    except _NONSENSE as error:
+        raise UserError(f"{robot.name}: its report of its tasks is invalid: {shown(repr(error)[:200])}") from error
 
 
 def _notes(cell: str, flood: dict[str, Any] | None, clock: str, data: str) -> Iterator[str]:

@@ -56,6 +56,10 @@ class Refused(Exception):
     """A reason, for whoever asked."""
 
 
+INVALID = (Refused, OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
+"""Exceptions that end a command with one line: the input is no release for this robot."""
+
+
 def slots() -> dict[str, Any]:
     """What flotilla-slot says."""
     fd, pid = piped("flotilla-slot", "show")
@@ -402,7 +406,7 @@ def main() -> int:
     yield_to_tasks()
     try:
         said = commands[sys.argv[1]]()
-    except (Refused, OSError, ValueError, KeyError) as error:
+    except INVALID as error:
         print(f"update: {error}" if isinstance(error, Refused) else f"update: {error!r}", file=sys.stderr)
         return 1
     said["memory_kib"] = peak_kib() + said.pop("beside_kib", 0)
