@@ -418,10 +418,19 @@ class Network(_Model):
     """Transport of messages between control tasks of several robots: UDP datagrams, or topics of Cyclone DDS."""
     dds_security: Annotated[bool, Strict()] = False
     """`true`: control tasks authenticate each other by certificates in DDS, and accept only authenticated messages.
-    Discovery takes some seconds longer."""
+    Discovery takes some seconds longer. The default is `true` where `transport` is `dds`; give `false` there if a
+    processor is too slow for it, as one of 400 MHz is (decision 75)."""
     update_kbit_s: Annotated[Integer, between(10, 1_000_000, unit="kbit/s")] = 300
     """Rate at which a station sends an update to several robots at once, headers included. The default is 30 % of the
     lowest rate of 802.11b, which multicast uses; control can use the rest."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _secure_by_default(cls, given: object) -> object:
+        """Only a line of the inventory leaves messages by DDS open."""
+        if isinstance(given, dict) and given.get("transport") == "dds":
+            return {"dds_security": True} | given
+        return given
 
 
 class Health(_Model):

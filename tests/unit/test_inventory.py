@@ -583,6 +583,16 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
     assert str(caught.value).count("\n") == 6
 
 
+@pytest.mark.parametrize(
+    ("line", "secured"),
+    [("udp", False), ("dds", True), ("dds\n  dds_security: false", False), ("dds\n  dds_security: true", True)],
+)
+def test_messages_by_dds_are_authenticated_unless_a_line_opens_them(tmp_path: Path, line: str, secured: bool) -> None:
+    """Seen to fail with `dds` alone: anybody in the cell could publish them."""
+    directory = edited(tmp_path / "inventory", (ALL, "transport: udp", f"transport: {line}"))
+    assert inventory.load_fleet(directory).network.dds_security is secured
+
+
 def test_radio_carries_the_address() -> None:
     fleet = inventory.load_fleet()
     radio = fleet.model_copy(update={"network": fleet.network.model_copy(update={"link": "ibss"})})
