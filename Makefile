@@ -357,8 +357,9 @@ measured = $(call option,--board,BOARD) $(call option,--kernel,KERNEL) $(call op
 latency: | setup-lab setup-runtime ## measure latency in virtual time; compare with a baseline | [PLAN=quick|standard|disk] [BOARD=x86_64] [KERNEL=lean|debian|no-rt] [TARGET=ssh:robot3]
 	$(Q)$(FLOTILLA) latency $(measured) $(call option,--target,TARGET)
 
-hwcheck: | setup ## write a robot's hardware to a file for a bug report | ROBOT=3 [SECONDS=60]
-	$(Q)$(FLOTILLA) hwcheck $(call need,ROBOT) $(call option,--seconds,SECONDS)
+hwcheck: | setup ## write a robot's hardware to a file, or draft a board's file | ROBOT=3 [SECONDS=60] or TARGET=ssh:USER@HOST NAME=board
+	$(Q)$(FLOTILLA) hwcheck $(if $(value TARGET),$(call option,--target,TARGET) $(call option,--name,NAME),$(call need,ROBOT)) \
+	    $(call option,--seconds,SECONDS)
 
 accept: | setup-station setup-lab setup-runtime ## test a robot's hardware and write a signed report | ROBOT=3 [PLAN=standard|quick|none] [SECONDS=60] [RELAYS=1] [WATCHDOG=1]
 	$(Q)$(FLOTILLA) accept $(call need,ROBOT) $(call option,--plan,PLAN) $(call option,--seconds,SECONDS) $(if $(filter-out 0,$(RELAYS)),--relays) \

@@ -343,15 +343,25 @@ def _releases_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _hwcheck(arguments: argparse.Namespace) -> None:
+    from flotilla.common.errors import UserError
     from flotilla.fleet import inventory
-    from flotilla.robot import hwcheck
+    from flotilla.robot import board_draft, hwcheck
 
-    print(hwcheck.check(inventory.robot(inventory.load_fleet(), arguments.robot), arguments.seconds))
+    if (arguments.robot is None) == (arguments.target is None) or (arguments.target is None) != (
+        arguments.name is None
+    ):
+        raise UserError("hwcheck: give ROBOT=3 for a robot, or TARGET=ssh:USER@HOST NAME=nuc7 for any Debian computer")
+    if arguments.target:
+        print(board_draft.draft(arguments.target, arguments.name))
+    else:
+        print(hwcheck.check(inventory.robot(inventory.load_fleet(), arguments.robot), arguments.seconds))
 
 
 def _hwcheck_arguments(parser: argparse.ArgumentParser) -> None:
-    robot_argument(parser)
+    parser.add_argument("robot", type=int, nargs="?", help="number in the inventory")
     parser.add_argument("--seconds", type=int, default=60, help="to look for hardware latency (%(default)s)")
+    parser.add_argument("--target", metavar="ssh:USER@HOST", help="any Debian computer: draft the board's file from it")
+    parser.add_argument("--name", metavar="NAME", help="of the board to draft")
 
 
 def _param(arguments: argparse.Namespace) -> None:
@@ -676,7 +686,8 @@ COMMANDS = (
     Command("Robots", "scope", "show or record the signals of a running task", _scope, _scope_arguments),
     Command("Robots", "releases", "list the release of each robot, and its trial state",
             _releases, _releases_arguments),
-    Command("Robots", "hwcheck", "write a robot's hardware to a file for a bug report", _hwcheck, _hwcheck_arguments),
+    Command("Robots", "hwcheck", "write a robot's hardware to a file, or draft a board's file",
+            _hwcheck, _hwcheck_arguments),
     Command("Robots", "provision", "apply the inventory to the robots", _provision, _provision_arguments),
     Command("Robots", "station", "serve a page that shows, drives and tunes the fleet", _page, _page_arguments,
             packages="station"),

@@ -65,6 +65,20 @@ ELSEWHERE = {
     "ping 10.42.0.3": "needs the robot",
     "make hwcheck ROBOT=3": "needs the robot; tests/boot/shared asks guests the same",
     **dict.fromkeys(
+        ("make hwcheck TARGET=ssh:root@192.168.1.20 NAME=nuc7", "ssh root@192.168.1.20 'dmesg | grep -i firmware'"),
+        "needs the computer; tests/boot/shared asks guests the same",
+    ),
+    **dict.fromkeys(
+        (
+            "mkdir -p ../rovers/packages",
+            "cp images/packages/pc_uefi.list ../rovers/packages/nuc7.list",
+            "echo 'firmware-realtek # Ethernet at full speed' >>../rovers/packages/nuc7.list",
+            "make lock ONLY=nuc7 FLEET=../rovers",
+            "make boot ROBOT=1 FLEET=../rovers",
+        ),
+        "needs a fleet with the board; image/test_home.py has one",
+    ),
+    **dict.fromkeys(
         ("make accept ROBOT=3", "make accept ROBOT=1 PLAN=none RELAYS=1", "make accept ROBOT=3 PLAN=none WATCHDOG=1"),
         "needs the robot; tests/boot/shared/test_robot_acceptance.py accepts a guest",
     ),

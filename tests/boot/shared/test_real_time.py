@@ -6,9 +6,11 @@ import fnmatch
 import re
 import time
 
+import yaml
+
 from flotilla.fleet import identity
 from flotilla.fleet.model import Board, Fleet
-from flotilla.robot import hwcheck
+from flotilla.robot import board_draft, hwcheck
 from tests.boot.guests import label, sh, until
 from tests.boot.shared.conftest import Report
 from tests.conftest import RobotGuest
@@ -106,6 +108,21 @@ def test_hardware_can_be_reported(robot: RobotGuest) -> None:
     assert any(line.startswith("hardware latency: ") and "not measured" not in line for line in summary), summary
     ports = {line.partition(":")[0] for line in summary if line.startswith("ttyS")}
     assert ports == {port.tty for port in robot.board.ports.values()}
+
+
+def test_the_boards_file_can_be_drafted(robot: RobotGuest) -> None:
+    """As `make hwcheck TARGET=` drafts it from a computer that nobody has described: what can be seen is right."""
+    board = robot.board
+    found = board_draft.read(sh(robot, board_draft.SCRIPT))
+    drafted = yaml.safe_load(board_draft.render(found, "drafted"))["board"]
+    same = ("architecture", "suite", "firmware", "processors", "network_interface")
+    assert {key: drafted[key] for key in same} == {key: getattr(board, key) for key in same}
+    assert drafted["ports"] == {name: {"tty": port.tty} for name, port in board.ports.items()}
+    assert {*found["disk"][0].split()[1:]} <= {*board.disk_modules}
+    assert drafted["modules"] == board.modules
+    assert [word for word in board.kernel_arguments if word.startswith("8250.nr")] == [
+        word.replace("=12", "=16") for word in drafted["kernel_arguments"]
+    ]
 
 
 def test_service_manager_feeds_the_watchdog(robot: RobotGuest) -> None:
