@@ -56,8 +56,8 @@ ssh: | setup ## open a shell on a robot, or on its guest if one runs | ROBOT=3
 verify: | setup ## build an image a second time and compare every byte | ROBOT=3
 	$(Q)$(FLOTILLA) verify $(call need,ROBOT)
 
-bundle: | setup ## build the update bundle of a board | [BOARD=smartcoret3] [SIGNATURES="FILE ..."]
-	$(Q)$(FLOTILLA) bundle $(if $(value BOARD),$(call given,BOARD)) $(addprefix --signature=,$(call each_given,SIGNATURES))
+bundle: | setup ## build the update bundle of a board | [BOARD=smartcoret3] [SIGNATURES="FILE ..."] [EXPIRES=2027-01-31]
+	$(Q)$(FLOTILLA) bundle $(if $(value BOARD),$(call given,BOARD)) $(call option,--expires,EXPIRES) $(addprefix --signature=,$(call each_given,SIGNATURES))
 
 verify-bundle: | setup ## rebuild a published bundle and compare it | BUNDLE=file
 	$(Q)$(FLOTILLA) verify-bundle $(call need,BUNDLE)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from flotilla.cli.command import Command, robot_argument
 
 if TYPE_CHECKING:
+    from datetime import date
+
     from flotilla.fleet.model import Fleet, Robot
 
 
@@ -136,18 +138,33 @@ def _bundle(arguments: argparse.Namespace) -> None:
     if final.exists():
         final.replace(before)
     try:
-        bundle.make(fleet, board, arguments.signature)
+        bundle.make(fleet, board, arguments.signature, arguments.expires)
     except BaseException:
         if before.exists():
             before.replace(final)
         raise
+    if before.exists() and (warning := release.same_number(release.read(before), release.read(final))):
+        print(warning)
     if before.exists() and (made := delta.between(release.read(before), release.read(final))):
         print(f"{paths.shown(made)}: {progress.size(made.stat().st_size)} for robots with the release before")
+
+
+def _day(text: str) -> date:
+    from datetime import date
+
+    return date.fromisoformat(text)
+
+
+_day.__name__ = "YYYY-MM-DD"  # in argparse's errors
 
 
 def _bundle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("board", nargs="?", help="a board (the first robot's)")
     parser.add_argument("--signature", type=Path, action="append", default=[], help="one that was made elsewhere")
+    parser.add_argument(
+        "--expires", type=_day, metavar="DATE",
+        help="last day on which robots accept the bundle: 2027-01-31 (`releases.lifetime_days` from today on)",
+    )  # fmt: skip
 
 
 def _cve(arguments: argparse.Namespace) -> None:

@@ -457,6 +457,8 @@ class Releases(_Model):
     release that they run: a new key comes to them by a release that the old ones have signed."""
     signatures: Annotated[Integer, between(1, 16)] = 1
     """Number of these keys that must have signed a release: 2 of 3, for instance."""
+    lifetime_days: Annotated[Integer, between(1, 3650, unit="days")] = 180
+    """Days after which an update bundle expires. Robots with the time of a station reject it from then on."""
 
     @model_validator(mode="after")
     def _enough(self) -> Releases:

@@ -124,6 +124,8 @@ class Told(_Answer):
     """Of the content of the running slot."""
     running: bool
     staged: bool
+    unchecked: Text = ""
+    """Why the expiry was not checked; empty if it was, or if the robot or the bundle has none."""
 
 
 _Model = TypeVar("_Model", bound=_Answer)

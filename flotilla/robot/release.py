@@ -10,6 +10,7 @@ import struct
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +37,23 @@ class Bundle:
         return header
 
     @property
-    def offer(self) -> bytes:
-        """What the robot's `begin` reads."""
-        return json.dumps({"manifest": self.manifest, "signatures": self.signatures}).encode()
+    def expires(self) -> str:
+        """Last day on which robots accept it, such as 2027-01-31, in UTC; empty if the bundle does not expire."""
+        return str(json.loads(self.manifest).get("expires", ""))
+
+    def expired(self, today: date) -> str:
+        """The message that robots may reject it from now on; empty before its last day is over."""
+        if not self.expires or today.isoformat() <= self.expires:
+            return ""
+        return (
+            f"{paths.shown(self.path)}: release {self.header['RELEASE']} expired on {self.expires}, so robots with the "
+            f"time of a station reject it; make it again: make bundle BOARD={self.header['BOARD']}"
+        )
+
+    def offer(self, accept_old: int | None = None) -> bytes:
+        """The input of the robot's `begin`. `accept_old`: number of a release that it accepts although it is old."""
+        offered = {"manifest": self.manifest, "signatures": self.signatures}
+        return json.dumps(offered if accept_old is None else offered | {"accept_old": accept_old}).encode()
 
     def extract(self, to: Path) -> None:
         """Write the slot's content to a file."""
@@ -103,6 +118,17 @@ def read(path: Path) -> Bundle:
     if content.size != int(bundle.header["BYTES"]):
         raise UserError(f"{paths.shown(path)} is cut off; make it again: `make bundle BOARD={path.stem}`")
     return bundle
+
+
+def same_number(before: Bundle, after: Bundle) -> str:
+    """The message that robots take two releases for equally new; empty if they differ in nothing or in their number."""
+    number = after.header["RELEASE"]
+    if before.header["RELEASE"] != number or before.header == after.header:
+        return ""
+    return (
+        f"{paths.shown(after.path)}: note: the bundle before it has other content and the same number, {number}; raise "
+        "`release:` in images/release.yml, so that robots reject the earlier one"
+    )
 
 
 def delta_of(base: str, content: str) -> Path:

@@ -1,8 +1,11 @@
-"""The update bundle of a board, which brings its release to robots in service: a tar file, reproducible.
+"""The update bundle of a board, which brings its release to robots in service: a tar file.
+
+The same release with the same day of expiry and the same signatures gives the same bytes. The day is in the manifest
+alone, so slot.img and its header are the same whenever the bundle is made.
 
 | member | what |
 |---|---|
-| manifest.json | format, header of the slot, SHA-256 of each chunk of slot.img and of the bills; robots judge by it |
+| manifest.json | format, header of the slot, day of expiry, SHA-256 of each chunk of slot.img and of the bills |
 | manifest.json.NAME.sig | its signature by the key NAME (`ssh-keygen -Y sign`) |
 | sbom.spdx.json, sbom.cdx.json | bills of materials |
 | slot.img | root, kernel, initramfs and release keys: all that a slot holds but the header |
@@ -16,6 +19,7 @@ import json
 import tarfile
 import time
 from collections.abc import Mapping, Sequence
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 
 from flotilla.common import cache, durable, host, namespace, paths, progress
@@ -35,21 +39,47 @@ def file_of(board: str) -> Path:
     return paths.BUNDLES / f"{board}.bundle"
 
 
-def make(fleet: Fleet, board: Board, signatures: Sequence[Path]) -> Path:
-    """Make the bundle of a board, signed by the keys that are here and by `signatures` made elsewhere."""
+def make(fleet: Fleet, board: Board, signatures: Sequence[Path], expires: date | None = None) -> Path:
+    """Make the bundle of a board, signed by the keys that are here and by `signatures` made elsewhere.
+
+    `expires`: its last day, in UTC. By default that of the manifest that was signed elsewhere, or the inventory's
+    `lifetime_days` from today on. Raises UserError if that day is over.
+    """
     host.check()
     namespace.check()
     started = time.monotonic()
     final = file_of(board.name)
+    today = datetime.now(UTC).date()
+    last_day = expiry(fleet.releases, today, expires, text_of(final) if signatures else None)
     with cache.exclusive():
         made = board_build(board, fleet.releases)
         bills = bills_of(made)
-        signed = pack(final, made.slot, fleet.releases, bills, made.lock.epoch, signatures)
+        signed = pack(final, made.slot, fleet.releases, bills, made.lock.epoch, signatures, last_day)
     print(
-        f"{paths.shown(final)}: release {slot.release().release} of {board.name}, "
+        f"{paths.shown(final)}: release {slot.release().release} of {board.name}, expires on {last_day}, "
         f"{progress.size(final.stat().st_size)}, signed by {', '.join(signed)}, {time.monotonic() - started:.1f} s"
     )
     return final
+
+
+def text_of(final: Path) -> Path:
+    """Where the manifest of a bundle lies for those who sign elsewhere."""
+    return final.with_suffix(".manifest.json")
+
+
+def expiry(releases: Releases, today: date, given: date | None, signed: Path | None) -> date:
+    """Last day of a bundle: `given`, that of the manifest `signed` elsewhere, or as many days from `today` on as the
+    inventory gives. UserError if it is over."""
+    there = signed is not None and signed.exists() and json.loads(signed.read_bytes()).get("expires")
+    last_day = given or (date.fromisoformat(there) if there else today + timedelta(days=releases.lifetime_days))
+    if last_day < today:
+        source = "EXPIRES" if given or not signed else f"{paths.shown(signed)}: expires"
+        raise UserError(
+            f"{source}={last_day}: that day is over, and robots would reject the bundle; give a later one: "
+            f"EXPIRES={today + timedelta(days=releases.lifetime_days)}"
+            + ("" if given else ", and have the manifest signed again")
+        )
+    return last_day
 
 
 def bills_of(made: BoardBuild) -> dict[str, bytes]:
@@ -64,14 +94,15 @@ def pack(
     bills: Mapping[str, bytes],
     epoch: int,
     signatures: Sequence[Path] = (),
+    expires: date | None = None,
 ) -> list[str]:
     """Write the bundle of what `slot.build` made in `content`; who has signed it. `bills`: further members.
 
-    The manifest is left beside it, for those who sign elsewhere.
+    The manifest is left beside it, for those who sign elsewhere. `expires`: last day; None: it does not expire.
     """
     final.parent.mkdir(parents=True, exist_ok=True)
-    described = manifest_of(content, bills)
-    text = final.with_suffix(".manifest.json")
+    described = manifest_of(content, bills, expires)
+    text = text_of(final)
     text.write_bytes(described)
     signed = _signatures(text, releases, signatures)
     members = {"manifest.json": described}
@@ -86,8 +117,8 @@ def pack(
     return sorted(signed)
 
 
-def manifest_of(content: Path, bills: Mapping[str, bytes]) -> bytes:
-    """The manifest of what `slot.build` made, and of its bills of materials."""
+def manifest_of(content: Path, bills: Mapping[str, bytes], expires: date | None = None) -> bytes:
+    """The manifest of what `slot.build` made, and of its bills of materials. `expires`: last day; None: no expiry."""
     chunks = []
     with (content / "slot.img").open("rb") as blob:
         while chunk := blob.read(CHUNK_BYTES):
@@ -96,6 +127,8 @@ def manifest_of(content: Path, bills: Mapping[str, bytes]) -> bytes:
     described = {"format": FORMAT, "header": header, "chunk_bytes": CHUNK_BYTES, "chunks": chunks}
     if bills:
         described["bills"] = {name: hashlib.sha256(bill).hexdigest() for name, bill in sorted(bills.items())}
+    if expires:
+        described["expires"] = expires.isoformat()
     return (json.dumps(described, indent=1) + "\n").encode()
 
 

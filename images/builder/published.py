@@ -8,6 +8,7 @@ import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import date
 from itertools import zip_longest
 from pathlib import Path
 from typing import IO, Any
@@ -39,6 +40,8 @@ class Manifest(pydantic.BaseModel):
     """SHA-256 of each chunk of slot.img."""
     bills: dict[str, str] = {}
     """SHA-256 of the bills of materials, by their names in the bundle."""
+    expires: date | None = None
+    """Last day, which the publisher chose; nothing to compare with. None: the bundle does not expire."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,9 @@ def verify(fleet: Fleet, file: Path) -> str:
         raise UserError("\n  ".join([f"{paths.shown(file)}: is not what this checkout builds:", *found]))
     return (
         f"{paths.shown(file)}: release {header['RELEASE']} of {board.name} is what this checkout builds: slot.img, "
-        f"{progress.size(int(header['BYTES']))}, and {', '.join(sorted(here.bills))}; signed by {', '.join(signed)}"
+        f"{progress.size(int(header['BYTES']))}, and {', '.join(sorted(here.bills))}; "
+        + (f"expires on {published.manifest.expires}; " if published.manifest.expires else "")
+        + f"signed by {', '.join(signed)}"
     )
 
 

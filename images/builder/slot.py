@@ -38,7 +38,7 @@ class Release(pydantic.BaseModel):
     release: Annotated[Integer, between(1, 10**9, "a number that counts up with each release")]
     """Number of the release that is built from this checkout."""
     floor: Annotated[Integer, between(1, 10**9, "the number of a release")]
-    """Robots that run this release refuse every release below."""
+    """Robots that run this release reject every release below, even if the operator accepts an older one."""
 
 
 def release() -> Release:

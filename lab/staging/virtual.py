@@ -108,7 +108,7 @@ def update(board: Board, directory: Path) -> Update:
     }  # fmt: skip
     files = {f"{DIRECTORY}/card/{at}": piece for at, piece in pieces.items()}
     own = {
-        "offer": release.Bundle(made, manifest, (signature(directory, manifest),), 0).offer,
+        "offer": release.Bundle(made, manifest, (signature(directory, manifest),), 0).offer(),
         "description": multicast.order(KEY, multicast.describe(sent)).encode(),
         "tape": symbols,
         "sender": (HERE / "sender.py").read_bytes(),

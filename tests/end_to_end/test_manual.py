@@ -104,6 +104,7 @@ ELSEWHERE = {
             "make update",
             'make update ROBOT=3 ARGS="-e stop_tasks=true"',
             'make update ROBOT=3 ARGS="-e go=back"',
+            'make update ROBOT=3 ARGS="-e accept_old=4"',
         ),
         "needs the robots; test_update.py plays the same on a guest",
     ),

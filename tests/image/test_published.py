@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tarfile
 from collections.abc import Callable
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def file(releases: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle that was published."""
     file = tmp_path_factory.mktemp("published") / "some.bundle"
     made = board_build(releases.board(), releases.releases)
-    bundle.pack(file, made.slot, releases.releases, bundle.bills_of(made), made.lock.epoch)
+    bundle.pack(file, made.slot, releases.releases, bundle.bills_of(made), made.lock.epoch, expires=date(2099, 12, 31))
     return file
 
 
@@ -69,7 +70,7 @@ def test_what_is_built_here_is_what_was_published(
 ) -> None:
     said = published.verify(releases, file)
     assert f"release 1 of {releases.board().name} is what this checkout builds" in said
-    assert said.endswith("and sbom.cdx.json, sbom.spdx.json; signed by release")
+    assert said.endswith("and sbom.cdx.json, sbom.spdx.json; expires on 2099-12-31; signed by release")
 
 
 def test_another_description_is_named(releases: Fleet, file: Path) -> None:

@@ -133,7 +133,7 @@ def test_the_updater_fits_into_its_memory(
 ) -> None:
     """With a delta that is really applied, between two contents of 80 MB."""
     offered = release.read(make(2))
-    told, peak = within_limit(guests, "begin", offered.offer)
+    told, peak = within_limit(guests, "begin", offered.offer())
     peaks = {"begin": (told["memory_kib"], peak)}
     assert len(told["missing"]) > 100
     sent = release.delta_of(told["base"], offered.header["BLOB"]).read_bytes()

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import random
+import shutil
 import subprocess
 import tarfile
 from dataclasses import dataclass, field
@@ -30,6 +31,14 @@ SEED = 18
 B = card.SLOTS[1]
 EMPTY = environment_block.make({}, card.HEADER_BYTES)
 """The header of a slot that holds nothing."""
+PAST, FUTURE = "2000-01-31", "9999-12-31"
+"""Days on which a release expires, whatever day it is."""
+NUMBERS = "1795957752.660562612,-0.000003154,0.000000420,0.000001358,-0.049,0.020,0.843,0.000010386,0.000003190,1.0"
+"""Of the tracking of chronyc 4.3, between stratum and leap status."""
+BY_A_STATION = f"0A2A00FE,10.42.0.254,4,{NUMBERS},Normal"
+LEADS_ORPHANS = f"7F7F0101,,10,{NUMBERS},Normal"
+FOLLOWS_AN_ORPHAN = f"0A2A0001,10.42.0.1,11,{NUMBERS},Normal"
+NOT_SYNCHRONISED = f"00000000,,0,{NUMBERS},Not synchronised"
 
 
 def header_of(blob: bytes, **changed: str) -> dict[str, str]:
@@ -57,6 +66,19 @@ class Robot:
     """The new release's content."""
     said: dict[str, Any] = field(default_factory=dict)
 
+    def start(self, slot: str) -> None:
+        """From now on this slot runs, as if the boot loader had chosen it."""
+        (self.card.parent / "running").write_text(slot)
+
+    def slot(self, *words: str) -> None:
+        subprocess.run(["flotilla-slot", *words], check=True, capture_output=True)
+
+    def clock(self, tracking: str) -> None:
+        """Set the output of `chronyc -n -c tracking`; an empty text if chronyd does not run."""
+        program = self.card.parent / "bin/chronyc"
+        program.write_text(f"#!/bin/sh\n[ \"$*\" = '-n -c tracking' ] && [ -n '{tracking}' ] && echo '{tracking}'\n")
+        program.chmod(0o755)
+
     def sign(self, text: str, *names: str, namespace: str = "flotilla-release") -> list[str]:
         argv = ["ssh-keygen", "-q", "-Y", "sign", "-n", namespace, "-f"]
         return [
@@ -71,8 +93,8 @@ class Robot:
         said: dict[str, Any] = getattr(self.module, command)()
         return said
 
-    def begin(self, text: str, signatures: list[str]) -> dict[str, Any]:
-        return self.run("begin", json.dumps({"manifest": text, "signatures": signatures}).encode())
+    def begin(self, text: str, signatures: list[str], **more: Any) -> dict[str, Any]:
+        return self.run("begin", json.dumps({"manifest": text, "signatures": signatures} | more).encode())
 
     def apply(self, delta: bytes, file: Path) -> dict[str, Any]:
         """`delta`, whose standard input is a file's."""
@@ -86,9 +108,9 @@ class Robot:
             os.dup2(kept, 0)
             os.close(kept)
 
-    def take(self, text: str, *names: str) -> None:
+    def take(self, text: str, *names: str, **more: Any) -> None:
         """The whole way of a release onto the card."""
-        told = self.begin(text, self.sign(text, *names))
+        told = self.begin(text, self.sign(text, *names), **more)
         told = self.run("copy")
         frames = b"".join(
             number.to_bytes(4, "little") + len(content).to_bytes(4, "little") + content
@@ -99,8 +121,22 @@ class Robot:
         assert self.run("finish")["staged"]
 
     def digest(self) -> str:
-        with self.card.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        """Of the card's blocks with any content, and their places; most of the file is a hole."""
+        found, place, end = hashlib.sha256(), 0, self.card.stat().st_size
+        descriptor = os.open(self.card, os.O_RDONLY)
+        try:
+            while place < end:
+                try:
+                    place = os.lseek(descriptor, place, os.SEEK_DATA)
+                except OSError:  # nothing but a hole follows
+                    break
+                block = os.pread(descriptor, CHUNK, place)
+                if any(block):
+                    found.update(place.to_bytes(8, "little") + block)
+                place += CHUNK
+        finally:
+            os.close(descriptor)
+        return found.hexdigest()
 
     def read(self, place: int, length: int) -> bytes:
         with self.card.open("rb") as file:
@@ -140,7 +176,9 @@ def robot(tmp_path: Path, keys: Path, flotilla_slot: Path, monkeypatch: pytest.M
             written.write(content)
     programs = tmp_path / "bin"
     programs.mkdir()
-    (programs / "flotilla-slot").write_text(f'#!/bin/sh\nexec {flotilla_slot} --disk {file} --running A "$@"\n')
+    (tmp_path / "running").write_text("A")
+    call = f'{flotilla_slot} --disk {file} --running "$(cat {tmp_path}/running)" "$@"'
+    (programs / "flotilla-slot").write_text(f"#!/bin/sh\nexec {call}\n")
     (programs / "flotilla-slot").chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}:/usr/bin:/bin")
     specification = importlib.util.spec_from_file_location("update", PROGRAM)
@@ -157,16 +195,19 @@ def robot(tmp_path: Path, keys: Path, flotilla_slot: Path, monkeypatch: pytest.M
             os.close(self._fd)
 
     monkeypatch.setattr(module, "Slot", Slot)
-    return Robot(module, file, keys, new)
+    made = Robot(module, file, keys, new)
+    made.clock(NOT_SYNCHRONISED)
+    return made
 
 
-def refused(robot: Robot, text: str, signatures: list[str]) -> str:
+def refused(robot: Robot, text: str, signatures: list[str], **more: Any) -> str:
     """Why, and that nothing has changed."""
-    before = robot.digest()
+    before, known = robot.digest(), Path(robot.module.KNOWN, "release")
+    begun = known.read_bytes() if known.exists() else b""
     with pytest.raises(robot.module.Refused) as why:
-        robot.begin(text, signatures)
+        robot.begin(text, signatures, **more)
     assert robot.digest() == before
-    assert not Path(robot.module.KNOWN).exists()
+    assert (known.read_bytes() if known.exists() else b"") == begun
     return str(why.value)
 
 
@@ -290,6 +331,156 @@ def test_what_is_not_for_this_robot(robot: Robot, name: str) -> None:
     assert why in refused(robot, text, robot.sign(text, "alice", "bob"))
 
 
+def offer(robot: Robot, number: int, **more: Any) -> tuple[str, list[str]]:
+    """A release of this number, signed; `more`: further members of its manifest."""
+    text = manifest_of(robot.blob, header_of(robot.blob, RELEASE=str(number)), **more)
+    return text, robot.sign(text, "alice", "bob")
+
+
+def test_a_release_older_than_the_running_one_is_rejected(robot: Robot) -> None:
+    """Although the signers admit 3 and above. Seen to fail: 4 was accepted by a robot that runs 5."""
+    why = refused(robot, *offer(robot, 4))
+    assert "release 4 is older than 5, which this robot runs" in why
+    assert "-e accept_old=4" in why
+    assert robot.begin(*offer(robot, 5))["slot"] == "B"
+    assert robot.begin(*offer(robot, 6))["slot"] == "B"
+
+
+def test_an_operator_may_accept_one_older_release(robot: Robot) -> None:
+    """By its number, which is in no bundle; never below the floor of the signers. Seen to fail where any number admits
+    each release."""
+    assert "is older than 5" in refused(robot, *offer(robot, 4, accept_old=4)), "a bundle accepts itself"
+    assert "is older than 5" in refused(robot, *offer(robot, 4), accept_old=3)
+    assert "release 2 is below 3" in refused(robot, *offer(robot, 2), accept_old=2)
+    robot.take(offer(robot, 4)[0], "alice", "bob", accept_old=4)
+    robot.run("activate")
+    robot.start("B")
+    robot.slot("confirm")
+    assert robot.module.slots()["slots"]["B"]["release"] == "4"
+    assert "release 3 is older than 4" in refused(robot, *offer(robot, 3))
+
+
+def test_the_floor_rises_with_a_confirmed_release_and_falls_with_a_return(robot: Robot) -> None:
+    """A trial changes nothing until it is confirmed. The operator's return to the other slot needs no permission."""
+    robot.take(offer(robot, 7)[0], "alice", "bob")
+    assert robot.begin(*offer(robot, 6))["slot"] == "B", "7 is on the card, but nobody has confirmed it"
+    robot.take(offer(robot, 7)[0], "alice", "bob")
+    robot.run("activate")
+    robot.slot("started")  # the boot loader has fallen back
+    assert robot.begin(*offer(robot, 6))["slot"] == "B"
+    robot.begin(*offer(robot, 7))
+    robot.run("activate")
+    robot.start("B")
+    assert "is on trial" in refused(robot, *offer(robot, 7))
+    robot.slot("confirm")
+    assert "release 6 is older than 7" in refused(robot, *offer(robot, 6))
+    robot.slot("trial", "A")
+    robot.start("A")
+    robot.slot("confirm")
+    assert robot.begin(*offer(robot, 5))["slot"] == "B"
+    assert "release 4 is older than 5" in refused(robot, *offer(robot, 4))
+
+
+@pytest.mark.parametrize("copies", [card.COPIES[:1], card.COPIES[1:], card.COPIES])
+def test_the_floor_outlives_the_boot_state(robot: Robot, copies: list[int]) -> None:
+    """A power cut may take any of its sectors: the floor is in the header of the slot that runs, and nowhere else."""
+    robot.take(offer(robot, 7)[0], "alice", "bob")
+    robot.run("activate")
+    robot.start("B")
+    robot.slot("confirm")
+    shutil.rmtree(robot.module.KNOWN)
+    with robot.card.open("r+b") as file:
+        for copy in copies:
+            file.seek(card.STATE.start + copy)
+            file.write(bytes(card.SECTOR))
+    assert "release 6 is older than 7" in refused(robot, *offer(robot, 6))
+    assert robot.begin(*offer(robot, 7))["slot"] == "A"
+
+
+def test_a_card_with_an_older_release_takes_that_and_newer_ones(robot: Robot) -> None:
+    """As it was flashed: slot B has never held anything."""
+    present = robot.read(card.SLOTS[0].start, len(robot.blob))
+    with robot.card.open("r+b") as file:
+        file.seek(card.SLOTS[0].end - card.HEADER_ROOM)
+        file.write(environment_block.make(header_of(present, RELEASE="3"), card.HEADER_BYTES))
+    assert robot.begin(*offer(robot, 3))["slot"] == "B"
+    assert "release 2 is below 3" in refused(robot, *offer(robot, 2))
+
+
+def test_an_expired_release_is_rejected_by_a_credible_clock(robot: Robot) -> None:
+    """That of a robot with the time of a station. Seen to fail: the date was ignored."""
+    robot.clock(BY_A_STATION)
+    why = refused(robot, *offer(robot, 6, expires=PAST))
+    assert f"release 6 expired on {PAST}" in why
+    assert "10.42.0.254" in why
+    assert "make bundle BOARD=smartcoret3" in why
+    assert "-e accept_old=6" in why
+    told = robot.begin(*offer(robot, 6, expires=FUTURE))
+    assert told["unchecked"] == ""
+    told = robot.begin(*offer(robot, 6, expires=PAST), accept_old=6)
+    assert told["unchecked"] == f"expiry on {PAST} not checked, by accept_old=6"
+
+
+@pytest.mark.parametrize(
+    "tracking",
+    [LEADS_ORPHANS, FOLLOWS_AN_ORPHAN, NOT_SYNCHRONISED, "", "506 Cannot talk to daemon"],
+    ids=["leads orphans", "follows an orphan", "not synchronised", "no daemon", "an error"],
+)
+@pytest.mark.parametrize("expires", [PAST, FUTURE])
+def test_another_clock_rejects_nothing_and_reports_that(robot: Robot, tracking: str, expires: str) -> None:
+    """A battery clock alone, or another robot's. Seen to fail where leap status Normal is enough, which a robot that
+    leads with a wrong battery clock reports, too."""
+    robot.clock(tracking)
+    told = robot.begin(*offer(robot, 6, expires=expires))
+    assert told["unchecked"].startswith(f"expiry on {expires} not checked: no station gives this robot the time")
+
+
+def test_a_robot_without_chrony_rejects_nothing(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    (robot.card.parent / "bin/chronyc").unlink()
+    monkeypatch.setenv("PATH", f"{robot.card.parent}/bin:{robot.card.parent}/usual")
+    (robot.card.parent / "usual").mkdir()
+    for name in ("cat", "rm", "ssh-keygen", "sh"):
+        (robot.card.parent / "usual" / name).symlink_to(str(shutil.which(name, path="/usr/bin:/bin")))
+    assert "not checked" in robot.begin(*offer(robot, 6, expires=PAST))["unchecked"]
+
+
+def test_a_clock_that_becomes_credible_stops_an_expired_release(robot: Robot) -> None:
+    """`activate` checks the date again. Seen to fail where `begin` alone does."""
+    robot.take(offer(robot, 6, expires=PAST)[0], "alice", "bob")
+    robot.clock(BY_A_STATION)
+    with pytest.raises(robot.module.Refused, match=f"release 6 expired on {PAST}"):
+        robot.run("activate")
+    assert robot.module.slots()["trial"] is None
+
+
+def test_a_manifest_without_its_date_is_not_signed(robot: Robot) -> None:
+    """Nor one with a later date. A bundle of an earlier version of the tool, which was signed without, is accepted, but
+    not below the running release."""
+    robot.clock(BY_A_STATION)
+    text, signatures = offer(robot, 6, expires=PAST)
+    described = json.loads(text)
+    for changed in (
+        {key: value for key, value in described.items() if key != "expires"}, described | {"expires": FUTURE},
+        described | {"expires": ""},
+    ):  # fmt: skip
+        assert "0 of the 2 signatures" in refused(robot, json.dumps(changed), signatures)
+    assert robot.begin(*offer(robot, 6))["unchecked"] == ""
+    assert "is older than 5" in refused(robot, *offer(robot, 4))
+
+
+def test_the_running_release_may_expire(robot: Robot) -> None:
+    """Nothing is installed then, so an update of several robots does not end at one that is up to date."""
+    robot.clock(BY_A_STATION)
+    present = robot.read(card.SLOTS[0].start, len(robot.blob))
+    text = manifest_of(present, header_of(present), expires=PAST)
+    assert robot.begin(text, robot.sign(text, "alice", "bob"))["running"]
+
+
+def test_the_stratum_of_orphans_is_the_configured_one(robot: Robot) -> None:
+    lines = (paths.OVERLAY / "etc/chrony/chrony.conf.j2").read_text().splitlines()
+    assert f"local stratum {robot.module.ORPHANS} orphan" in lines
+
+
 def test_a_release_on_trial_takes_no_other(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     """It would be written over the one to go back to."""
     text = manifest_of(robot.blob, header_of(robot.blob))
@@ -354,7 +545,7 @@ def test_a_bundle_is_read_as_it_was_made(robot: Robot, tmp_path: Path) -> None:
     text = manifest_of(robot.blob, header_of(robot.blob))
     file = pack(tmp_path / "smartcoret3.bundle", text, robot.sign(text, "alice", "bob"), robot.blob)
     bundle = release.read(file)
-    told = robot.run("begin", bundle.offer)
+    told = robot.run("begin", bundle.offer())
     robot.run("copy")
     for batch in bundle.chunks(told["missing"], 5 * CHUNK):
         robot.run("write", batch)

@@ -7,6 +7,7 @@ import os
 import secrets
 import shlex
 import time
+from datetime import UTC, datetime
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
 
     | do | for | arguments | result |
     |---|---|---|---|
-    | ask | a robot | | `told`: what the robot says it lacks |
+    | ask | a robot | `accept_old`: number | `told`: what the robot says it lacks |
     | share | all | `asked`: results of `ask` by robot; `by` | `shipments` for several robots each, `station` |
     | listen | a robot | `shared`: result of `share` | `listens`: whether it receives its shipment |
     | send | all | `shared`; `listening`: results of `listen` by robot; `kbit_s` | `reports`, one for each shipment |
@@ -69,7 +70,11 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
     def _ask(self) -> dict[str, Any]:
         file = self._bundle_file()
         bundle = release.read(file)
-        told = self._update("begin", bundle.offer)
+        if warning := bundle.expired(datetime.now(UTC).date()):
+            self._display.warning(warning)
+        told = self._begin(bundle)
+        if told.get("unchecked"):
+            self._say(f"{self._name}: {told['unchecked']}")
         if staging.Lack(file, told).anything and not bundle.delta(told) and not self._task.check_mode:
             told = self._update("copy")
         if not bundle.has(told["missing"]):
@@ -198,7 +203,10 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
         return told
 
     def _begun(self) -> dict[str, Any]:
-        return self._update("begin", release.read(self._lack().bundle).offer)
+        return self._begin(release.read(self._lack().bundle))
+
+    def _begin(self, bundle: release.Bundle) -> dict[str, Any]:
+        return self._update("begin", bundle.offer(_accept_old(self._task.args.get("accept_old"))))
 
     def _lack(self) -> staging.Lack:
         asked = self._task.args["asked"]
@@ -261,6 +269,15 @@ def _parsed(said: str) -> object:
         return json.loads(said)
     except (ValueError, RecursionError):
         return None
+
+
+def _accept_old(value: object) -> int | None:
+    """The number of a release, as the command line has it; None for none."""
+    if value in (None, ""):
+        return None
+    if not str(value).isdecimal():
+        raise UserError(f"accept_old={value}: give the number of the release, `release:` in images/release.yml")
+    return int(str(value))
 
 
 def _kbit_s(value: object) -> int:

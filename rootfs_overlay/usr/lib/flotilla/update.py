@@ -2,8 +2,9 @@
 """Brings a release into the slot that does not run: checks it, writes it, reads it back. One command at a time.
 
   begin     standard input: {"manifest": TEXT, "signatures": [TEXT, ...]}; the release is taken if it is signed as the
-            running one asks, made for this board and card, and not below the running one's floor. It stays known until
-            another one begins.
+            running one asks, made for this board and card, neither older than the running one nor expired. It stays
+            known until another one begins. With "accept_old": NUMBER the operator accepts the release of that number
+            although it is older or expired, but not below the floor of the running one.
   copy      take what the running release has in the same place
   write     standard input: chunks, each behind its number and length (two unsigned 32-bit numbers, little-endian)
   delta     standard input: a delta from the running release's content, as flotilla-patch reads it
@@ -13,7 +14,8 @@
 
 Each prints one object of JSON: `release`, `slot`, `base` (SHA-256 of the running release's content), `running` (the
 release runs already), `staged` (the slot holds it), `missing` (numbers of chunks that the slot does not hold yet),
-`chunk_bytes`, `memory_kib` (the peak so far, with that of flotilla-patch). Whatever is cut off, by power or by the
+`unchecked` (why `begin` and `activate` did not check the expiry, or nothing), `chunk_bytes`, `memory_kib` (the peak so
+far, with that of flotilla-patch). Whatever is cut off, by power or by the
 radio, begins again with `begin`, and goes on where it was. Status 1: refused, with the reason on standard error.
 
 The header is cleared before anything else of the slot is written, and written when all of it is on the card
@@ -28,6 +30,7 @@ import mmap
 import os
 import struct
 import sys
+import time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # without an import: it takes time
@@ -49,6 +52,8 @@ SIGNATURE = b"# GRUB Environment Block\n"
 HEADER_ROOM, HEADER_BYTES = 4096, 1024
 SECTOR = 512
 LARGEST_CHUNK = 1 << 18
+ORPHANS = 10
+"""Stratum of a clock that no station leads (/etc/chrony/chrony.conf)."""
 SIGKILL = 9  # without `signal`, which takes a quarter of a MB
 
 
@@ -61,7 +66,7 @@ INVALID = (Refused, OSError, ValueError, LookupError, TypeError, AttributeError,
 
 
 def slots() -> dict[str, Any]:
-    """What flotilla-slot says."""
+    """The answer of `flotilla-slot show`."""
     fd, pid = piped("flotilla-slot", "show")
     with open(fd, "rb") as shown:
         text = shown.read()
@@ -163,8 +168,11 @@ def partition(slot: str) -> str:
 class Release:
     """A release that this robot may take."""
 
-    def __init__(self, text: str, signatures: list[str]) -> None:
-        """Refused unless it is signed as the running release asks, made for this board and card, and not too old."""
+    def __init__(self, text: str, signatures: list[str], accept_old: int | None = None) -> None:
+        """Refused unless it is signed as the running release asks, made for this board and card, and not too old.
+
+        `accept_old`: the number of a release that may be too old, by the operator's word.
+        """
         state = slots()
         if not state["running"]:
             raise Refused("this robot was started from no slot")
@@ -180,10 +188,13 @@ class Release:
         for name, what in (("BOARD", "board"), ("LAYOUT", "layout of the card")):
             if self.header[name] != present[name]:
                 raise Refused(f"the release is for {what} {self.header[name]}, this robot has {present[name]}")
-        if int(self.header["RELEASE"]) < int(present["FLOOR"]):
-            raise Refused(
-                f"release {self.header['RELEASE']} is below {present['FLOOR']}, the oldest that the running one admits"
-            )
+        self.running = present == self.header
+        number = int(self.header["RELEASE"])
+        if not self.running:
+            check_number(number, present, accept_old)
+        self.number, self.accepted = number, number == accept_old
+        self.expires = str(manifest.get("expires", ""))  # none in bundles of earlier versions
+        self.unchecked = ""
         self.chunk_bytes: int = manifest["chunk_bytes"]
         self.chunks: list[str] = manifest["chunks"]
         self.slot = Slot("B" if running.name == "A" else "A", state, writable=True)
@@ -194,8 +205,21 @@ class Release:
             raise Refused(f"{len(self.chunks)} chunks are not what {size} bytes have")
         self.size = size
         self.present = present
-        self.running = present == self.header
         self.base = running
+
+    def check_expiry(self) -> None:
+        """Reject an expired release by a credible clock; `unchecked` is the reason why that was not checked."""
+        if self.running or not self.expires:
+            return
+        if self.accepted:
+            self.unchecked = f"expiry on {self.expires} not checked, by accept_old={self.number}"
+        elif not (source := time_source()):
+            self.unchecked = f"expiry on {self.expires} not checked: no station gives this robot the time"
+        elif (today := time.strftime("%Y-%m-%d", time.gmtime())) > self.expires:
+            raise Refused(
+                f"release {self.number} expired on {self.expires}, and the time from {source} is {today}: make the "
+                f"bundle again (make bundle BOARD={self.header['BOARD']}), or {by_operator(self.number)}"
+            )
 
     def length(self, number: int) -> int:
         return min(self.chunk_bytes, self.size - number * self.chunk_bytes)
@@ -232,7 +256,43 @@ class Release:
             "staged": self.staged(),
             "missing": missing,
             "chunk_bytes": self.chunk_bytes,
+            "unchecked": self.unchecked,
         }
+
+
+def check_number(number: int, present: dict[str, str], accept_old: int | None) -> None:
+    """Check the number of a release for a robot whose running slot has the header `present`.
+
+    That header was written before the running release was confirmed, and is not written while it runs. So the floor
+    needs no state of its own: it rises with a release that is confirmed, and falls when the other slot runs again.
+    """
+    if number < int(present["FLOOR"]):
+        raise Refused(f"release {number} is below {present['FLOOR']}, the oldest that the running one admits")
+    if number < int(present["RELEASE"]) and number != accept_old:
+        raise Refused(
+            f"release {number} is older than {present['RELEASE']}, which this robot runs: raise `release:` in "
+            f"images/release.yml and make the bundle again, or {by_operator(number)}"
+        )
+
+
+def by_operator(number: int) -> str:
+    return f'accept this one: make update ARGS="-e accept_old={number}"'
+
+
+def time_source() -> str:
+    """Address of the computer from which chronyd has a time that is not the fleet's own; empty where there is none.
+
+    Without a station robots follow the battery clock of one of them, at the stratum of orphans and above.
+    """
+    try:
+        fd, pid = piped("chronyc", "-n", "-c", "tracking")
+    except OSError:
+        return ""
+    with open(fd) as answer:
+        fields = answer.read().strip().split(",")
+    if ended(pid) or len(fields) < 14 or fields[13] == "Not synchronised":
+        return ""
+    return fields[1] if fields[2].isdecimal() and int(fields[2]) < ORPHANS else ""
 
 
 def keys_of(slot: Slot, header: dict[str, str]) -> dict[str, Any]:
@@ -279,12 +339,13 @@ def known() -> Release:
             told = json.load(file)
     except FileNotFoundError:
         raise Refused("no release has begun: `begin` first") from None
-    return Release(told["manifest"], told["signatures"])
+    return Release(told["manifest"], told["signatures"], told.get("accept_old"))
 
 
 def begin() -> dict[str, Any]:
     told = json.load(sys.stdin)
-    release = Release(told["manifest"], told["signatures"])
+    release = Release(told["manifest"], told["signatures"], told.get("accept_old"))
+    release.check_expiry()
     os.makedirs(KNOWN, mode=0o700, exist_ok=True)
     beside = f"{KNOWN}/release.new"
     with open(beside, "w") as file:
@@ -380,6 +441,7 @@ def activate() -> dict[str, Any]:
         raise Refused("this release runs already")
     if not release.staged():
         raise Refused(f"slot {release.slot.name} does not hold release {release.header['RELEASE']} yet: `finish` first")
+    release.check_expiry()  # again: a station may have given the time since then
     run("rm", "-rf", f"{LAYERS}/{release.slot.name}")
     os.sync()
     run("flotilla-slot", "trial", release.slot.name)
