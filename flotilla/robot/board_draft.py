@@ -66,7 +66,7 @@ _QEMU_PORTS = 4
 
 
 def draft(way: str, name: str) -> str:
-    """Ask the computer `way`, as `ssh:user@host`; write the draft of `board_NAME.yml`, and return a line that names the file.
+    """Ask the computer `way`, as `ssh:user@host`; write the draft of `board_NAME.yml`; a line that names the file.
 
     UserError if the computer does not answer, or is none that images can be built for.
     """
