@@ -212,7 +212,7 @@ _ISA_WATCHDOGS = {
 
 def _qemu(architecture: str, firmware: str, ports: Mapping[str, str], memory_kib: int) -> dict[str, object]:
     """A computer of the same kind, with as many serial ports as a PC has."""
-    count = min(max(len(ports), 2), _QEMU_PORTS)
+    count = min(len(ports), _QEMU_PORTS)
     return {
         "system": {"amd64": "x86_64", "i386": "i386"}[architecture],
         "machine": _QEMU[firmware]["machine"],
