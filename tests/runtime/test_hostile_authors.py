@@ -479,8 +479,15 @@ case " $* " in *" --reuid=app --regid=app --clear-groups --bounding-set=-all --i
 while case $1 in --*) ;; *) false ;; esac; do shift; done
 AS=app exec "$@"
 """
+ALONE = """#!/bin/sh
+read -r score </proc/self/oom_score_adj
+[ "$score" = 1000 ] || exit 1
+case " $* " in *" --net --pid --fork --kill-child "*) ;; *) exit 1 ;; esac
+while case $1 in --*) ;; *) false ;; esac; do shift; done
+ALONE=alone exec "$@"
+"""
 RECORDS = """#!/bin/sh
-echo "{name} as ${{AS:-root}}" >>{log}
+echo "{name} as ${{AS:-root}} ${{ALONE:-among others}}" >>{log}
 exit 1
 """
 
@@ -488,11 +495,12 @@ exit 1
 def test_a_robot_runs_no_code_of_an_app_as_root_to_check_it(tmp_path: Path) -> None:
     """The robot's script, with programs in place of its own that record who starts them, and refuse the app.
 
-    Seen to fail: `flotilla-run as root`, so a plug-in's constructor was root; root's `cat` followed an app's link."""
+    Seen to fail: `flotilla-run as root`, so a plug-in's constructor was root; root's `cat` followed an app's link;
+    `among others`: the code had the robot's network, and its processes went on."""
     log, programs, apps = tmp_path / "log", tmp_path / "bin", tmp_path / "apps"
     programs.mkdir()
     texts = {name: RECORDS.format(name=name, log=log) for name in ("flotilla-run", "ldd", "head", "cat")}
-    for name, text in {**texts, "setpriv": AS_APP}.items():
+    for name, text in {**texts, "setpriv": AS_APP, "unshare": ALONE}.items():
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
     script = remote.SCRIPT.read_text().replace("/data/apps", str(apps)).replace("/var/lib/flotilla-apps", str(apps))
@@ -506,4 +514,4 @@ def test_a_robot_runs_no_code_of_an_app_as_root_to_check_it(tmp_path: Path) -> N
         argv = ["sh", "-c", script, "flotilla", *words]
         done = subprocess.run(argv, env=environment, input=archive.getvalue(), capture_output=True, check=False)
         assert done.returncode, done.stderr
-    assert log.read_text().splitlines() == ["flotilla-run as app", "head as app"]
+    assert log.read_text().splitlines() == ["flotilla-run as app alone", "head as app alone"]
