@@ -493,10 +493,10 @@ exit 1
 
 
 def test_a_robot_runs_no_code_of_an_app_as_root_to_check_it(tmp_path: Path) -> None:
-    """The robot's script, with programs in place of its own that record who starts them, and refuse the app.
+    """The robot's script, with programs in place of its own that record who starts them, and reject the app.
 
     Seen to fail: `flotilla-run as root`, so a plug-in's constructor was root; root's `cat` followed an app's link;
-    `among others`: the code had the robot's network, and its processes went on."""
+    `among others`: the code had the robot's network, and its processes were left."""
     log, programs, apps = tmp_path / "log", tmp_path / "bin", tmp_path / "apps"
     programs.mkdir()
     texts = {name: RECORDS.format(name=name, log=log) for name in ("flotilla-run", "ldd", "head", "cat")}
