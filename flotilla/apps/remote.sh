@@ -59,10 +59,13 @@ is_there() {
     diff -rq --no-dereference "$1" "$apps/.$name@$version" >/dev/null 2>&1
 }
 
-# Run a program as the app will run: what it loads is the app's code, which must not run as root.
-as_app() {
-    timeout -k 5 60 setpriv --reuid=app --regid=app --clear-groups --bounding-set=-all --inh-caps=-all --no-new-privs "$@"
-}
+# Run a program as the app will run: what it loads is the app's code, which must not run as root. It has no network, none of
+# its processes is left, and when memory is short it ends first.
+as_app() (
+    echo 1000 >/proc/self/oom_score_adj
+    exec unshare --net --pid --fork --kill-child timeout -k 5 60 \
+        setpriv --reuid=app --regid=app --clear-groups --bounding-set=-all --inh-caps=-all --no-new-privs "$@"
+)
 
 # Take the app's files from standard input, and put them in the place of what is there once nothing can fail any more:
 # VERSION of the files, KiB that must be free, PROGRAM or nothing.

@@ -31,9 +31,6 @@ WARNINGS = ("-Wall", "-Wextra", "-Werror")
 _KIND = "runtime"
 """Of results in the cache."""
 MADE_BY = (runtime_stage.__file__, chroot.__file__, namespace.__file__)
-_CHECK_SECONDS = 60
-_CHECK_BYTES = 1 << 20
-"""Of what it writes about plug-ins and tasks."""
 _BY_SIGNAL = 128
 """What bubblewrap adds to the signal that ended a program."""
 _LEFT_OUT = ("bench", "tests", "tidy.py")
@@ -195,7 +192,7 @@ def check_task(path: Path, content: bytes, plugins: Path | None = None, system: 
 
 def _said(program: str, done: subprocess.CompletedProcess[str]) -> str:
     """Why it failed. Of a crash it does not say so itself, and a code of a block may say anything."""
-    if refused := sandbox.refusal(done.stderr):
+    if refused := sandbox.refusal(done.stderr, sandbox.CHECK, done.returncode):
         raise refused
     if done.returncode - _BY_SIGNAL not in {each.value for each in signal.Signals}:
         return done.stderr.strip() or f"{program} ended with status {done.returncode}"
@@ -219,10 +216,8 @@ def _run(system: System, needed: Sequence[Path], program: str, *arguments: str) 
     tree, programs = tools.tree(read_lock(runtime_lock(system))), _programs(system)
     argv = tools.command(tree, programs / "usr/bin" / program, system.architecture)
     environment = {"LC_ALL": "C.UTF-8", "PATH": "/usr/bin"}
-    sandboxed = sandbox.command(
-        [*argv, *arguments], readable=[tree, programs, *needed], environment=environment, seconds=_CHECK_SECONDS,
-        file_bytes=_CHECK_BYTES,
-    )  # fmt: skip
+    needed = [tree, programs, *needed]
+    sandboxed = sandbox.command([*argv, *arguments], sandbox.CHECK, readable=needed, environment=environment)
     # Into files, to which the limit applies.
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as said:
         done = subprocess.run(sandboxed, stdin=subprocess.DEVNULL, stdout=output, stderr=said, check=False)

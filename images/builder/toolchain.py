@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flotilla.common import namespace, paths, sandbox
+from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board
 from images.builder import pool, tools
 from images.builder.chroot import Chroot
@@ -50,7 +51,12 @@ def run(lock_name: str, work: Path, command: Sequence[str], log: Path) -> None:
     chroot = Chroot(Path("/"), lock.epoch)
     moved = {"/run/faketime": Path(os.environ["FAKETIME_LIBRARIES"])} if chroot.clock else {}
     argv = sandbox.command(
-        [*chroot.clock, *command], root=tools.tree(lock), writable={"/out": work}, mounted=moved,
+        [*chroot.clock, *command], sandbox.BUILD, root=tools.tree(lock), writable={"/out": work}, mounted=moved,
         environment=chroot.environment,
     )  # fmt: skip
-    namespace.run_logged(__name__, argv, log)
+    try:
+        namespace.run_logged(__name__, argv, log)
+    except UserError as error:
+        if refused := sandbox.refusal(namespace.log_text(log), sandbox.BUILD):
+            raise UserError(f"{refused}\n{error}") from None
+        raise

@@ -5,109 +5,144 @@ Each tries to read a planted key, to write outside its folder, to reach the netw
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import io
 import os
 import re
 import shutil
-import socket
+import stat
 import subprocess
 import tarfile
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import pytest
 
-from flotilla.apps import app, builder, fmu, remote, remote_compiler, scaffold
-from flotilla.common import paths
+from flotilla.apps import app, builder, fmu, imported, remote, remote_compiler, scaffold
+from flotilla.common import paths, sandbox
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
 from images.builder import runtime
 from images.builder.lock import HOST, runtime_lock
+from tests import hostile
+from tests.figures import PROPERTY
+from tests.hostile import SECRET
 
-SECRET = "the key of a release"
-ATTACK = """\
-#define _GNU_SOURCE
-#include <arpa/inet.h>
-#include <fcntl.h>
-#include <sched.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <sys/socket.h>
-#include <unistd.h>
 
-int main(void)
-{
-    return 0;
-}
-
-__attribute__((constructor)) static void attack(void)
-{
-    char key[64] = "";
-    struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons(PORT), .sin_addr = {htonl(0x7f000001)}};
-    int file = open(KEY, O_RDONLY), out = open(MARKER, O_CREAT | O_WRONLY, 0644), breaks = 0;
-    if (file >= 0 && read(file, key, sizeof key - 1) > 0)
-        breaks = fprintf(stderr, "has read %s\\n", key);
-    if (out >= 0)
-        close(out);
-    if (connect(socket(AF_INET, SOCK_STREAM, 0), (struct sockaddr *)&to, sizeof to) == 0)
-        breaks = fprintf(stderr, "reached the network\\n");
-    if (unshare(CLONE_NEWUSER) == 0)
-        breaks = fprintf(stderr, "made a user namespace\\n");
-    if (unshare(CLONE_NEWNS) == 0) /* of this process alone: a test that fails must not change the computer */
-        breaks = fprintf(stderr, "may mount\\n");
-    if (chroot(".") == 0)
-        breaks = fprintf(stderr, "changed its root\\n");
-    fprintf(stderr, "ran, and broke %s\\n", breaks ? "out" : "nothing");
-    if (CRASH)
-        abort();
-    exit(1);
-}
-"""
-"""Compiled with KEY, MARKER, PORT and CRASH."""
+@pytest.fixture(scope="module")
+def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hostile.Target]:
+    with hostile.target(tmp_path_factory.mktemp("hostile")) as made:
+        yield made
 
 
 @pytest.fixture
-def defines(tmp_path: Path) -> Iterator[list[str]]:
-    """Of ATTACK; somebody listens at the port."""
-    (tmp_path / "keys").mkdir()
-    (tmp_path / "keys/release").write_text(SECRET)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        yield [f'-DKEY="{tmp_path}/keys/release"', f'-DMARKER="{tmp_path}/marker"', f"-DPORT={port}"]
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits that tests reach soon."""
+    for name in ("BUILD", "CHECK"):
+        limits = getattr(sandbox, name)
+        small = {**hostile.SMALL, "file_bytes": min(hostile.SMALL["file_bytes"], limits.file_bytes)}
+        monkeypatch.setattr(sandbox, name, dataclasses.replace(limits, **small))
 
 
-@pytest.fixture
-def plugins(tmp_path: Path, defines: list[str]) -> Callable[[int], Path]:
-    """The directory with a plug-in that attacks as soon as it is loaded, and may crash then."""
-
-    def compiled(crash: int) -> Path:
-        (tmp_path / "attack.c").write_text(ATTACK)
-        command = ["cc", "-shared", "-fPIC", *defines, f"-DCRASH={crash}", "-o", "attack.so", "attack.c"]
-        (tmp_path / "blocks").mkdir()
-        subprocess.run([*command[:-3], "-o", tmp_path / "blocks/attack.so", tmp_path / "attack.c"], check=True)
-        return tmp_path / "blocks"
-
-    return compiled
+def shortened(monkeypatch: pytest.MonkeyPatch, attack: str) -> None:
+    """The limit of time, for attacks that wait for it."""
+    for name in ("BUILD", "CHECK") if attack == "waiting" else ():
+        monkeypatch.setattr(sandbox, name, dataclasses.replace(getattr(sandbox, name), seconds=2))
 
 
-@pytest.mark.parametrize("crash", [0, 1])
-@pytest.mark.parametrize("checked", ["plug-in", "task"])
-def test_a_plugin_that_is_checked_reaches_nothing(
-    plugins: Callable[[int], Path], tmp_path: Path, checked: str, crash: int
-) -> None:
-    """Seen to fail: `has read the key of a release`, `wrote a file`, `reached the network`, `changed its root`."""
-    directory, task = plugins(crash), b"period: 10 ms\nblocks:\n  a: {type: attack}\n"
-    checks: dict[str, Callable[[], object]] = {
-        "plug-in": lambda: runtime.check_plugins(directory, HOST),
-        "task": lambda: runtime.check_task(tmp_path / "task.yml", task, directory, HOST),
-    }
+Stage = Callable[[hostile.Target, Path, Board, str], str]
+"""Where an attack runs; its messages."""
+
+
+def make_build(target: hostile.Target, place: Path, board: Board, attack: str) -> str:
+    """The Makefile of an app starts the attack."""
+    if not (place / "hover").exists():
+        scaffold.create("make", "hover", place)
+        shutil.copy(target.program, place / "hover" / target.alias)
+    kept = " 2>&1 | cat >hover" if attack == "all" else ""
+    (place / "hover/Makefile").write_text(f"hover:\n\t./{target.alias} '{attack}'{kept}\n.PHONY: hover\n")
+    builder.build(app.load(place / "hover"), board, place / "out")
+    return (place / "out/hover").read_text()
+
+
+def plugin_check(target: hostile.Target, place: Path, board: Board, attack: str) -> str:
+    """The constructor of a plug-in does, which the runtime lists."""
+    target.named.write_text(attack)
     with pytest.raises(UserError) as refused:
-        checks[checked]()
-    said = str(refused.value).splitlines()
-    assert "ran, and broke nothing" in said
-    assert bool(crash) == any("was ended by SIGABRT" in line for line in said)
-    assert not (tmp_path / "marker").exists()
+        runtime.check_plugins(target.plugins, HOST)
+    return str(refused.value)
+
+
+def task_check(target: hostile.Target, place: Path, board: Board, attack: str) -> str:
+    """It does, when the runtime checks a task with it."""
+    target.named.write_text(attack)
+    task = b"period: 10 ms\nblocks:\n  a: {type: attack}\n"
+    with pytest.raises(UserError) as refused:
+        runtime.check_task(place / "task.yml", task, target.plugins, HOST)
+    return str(refused.value)
+
+
+STAGES: dict[str, Stage] = {"Makefile": make_build, "plug-in": plugin_check, "task": task_check}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_code_of_an_author_reaches_nothing(
+    target: hostile.Target, tmp_path: Path, board: Board, stage: str, record_property: Callable[[str, str], None]
+) -> None:
+    """Seen to fail: `may set the kernel's core_pattern` where root builds, the builder's environment, a key of its
+    session's keyring, and the mode of its log. Before there was a sandbox, most of them succeeded."""
+    said = STAGES[stage](target, tmp_path, board, "all")
+    attacks = [*hostile.ATTACKS, *hostile.ROOTS_ATTACKS]
+    assert [attack for attack in attacks if f"attacked: {attack}" not in said.splitlines()] == [], said
+    found = target.evidence(said)
+    record_property(PROPERTY, f"hostile author, {stage}: {len(attacks)} attacks, {len(found)} traces of success")
+    assert found == [], said
+
+
+@pytest.mark.parametrize("attack", hostile.LIMITS)
+@pytest.mark.parametrize("stage", STAGES)
+def test_code_of_an_author_takes_no_more_than_its_part(
+    target: hostile.Target,
+    tmp_path: Path,
+    board: Board,
+    stage: str,
+    attack: str,
+    small: None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of memory, processes, files, messages and time. Seen to fail: each ended by itself after its time."""
+    shortened(monkeypatch, attack)
+    if stage == "Makefile":
+        with pytest.raises(UserError) as refused:
+            make_build(target, tmp_path, board, attack)
+        said = str(refused.value)
+        assert f"{tmp_path}/hover: nothing was built: " in said
+    else:
+        said = STAGES[stage](target, tmp_path, board, attack)
+    limit = hostile.LIMITS[attack]
+    if stage != "Makefile":
+        limit = {"one file": "1 MiB for a file", "holes": "1 MiB for a file"}.get(attack, limit)
+    assert f"the sandbox's limit of {limit}" in said.splitlines()[0]
+    assert target.evidence("") == []
+
+
+@pytest.mark.parametrize("attack", [*hostile.ATTACKS, *hostile.LIMITS])
+def test_the_same_attack_succeeds_without_a_sandbox(target: hostile.Target, attack: str) -> None:
+    assert target.plainly(attack)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="the computer itself rejects these, but for root")
+@pytest.mark.parametrize("attack", hostile.ROOTS_ATTACKS)
+def test_the_same_attack_of_root_succeeds_without_a_sandbox(target: hostile.Target, attack: str) -> None:
+    assert target.plainly(attack)
+
+
+def test_a_crash_of_a_plugin_is_named(target: hostile.Target, tmp_path: Path, board: Board) -> None:
+    for check in (plugin_check, task_check):
+        assert "was ended by SIGABRT" in check(target, tmp_path, board, "crash")
 
 
 LIES = [
@@ -142,6 +177,12 @@ def board(fleet: Fleet) -> Board:
 
 
 @pytest.fixture
+def planted(tmp_path: Path) -> None:
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "keys/release").write_text(SECRET)
+
+
+@pytest.fixture
 def made(tmp_path: Path, board: Board, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
     """Build an app with a Makefile, by the locked compiler; what goes to a robot."""
     scaffold.create("make", "hover", tmp_path)
@@ -155,14 +196,68 @@ def made(tmp_path: Path, board: Board, monkeypatch: pytest.MonkeyPatch) -> Calla
     return make
 
 
-def test_a_makefile_reaches_nothing(made: Callable[..., Path], tmp_path: Path, defines: list[str]) -> None:
-    """Seen to fail: `reached the network`."""
-    (tmp_path / "hover/attack.c").write_text(ATTACK)
-    words = " ".join(f"'{each}'" for each in [*defines, "-DCRASH=0"])
-    out = made(f"hover:\n\t$(CC) {words} -o attack attack.c\n\t./attack 2>hover; ls {tmp_path} >>hover 2>&1; true\n")
-    assert (out / "hover").read_text().splitlines()[0] == "ran, and broke nothing"
-    assert "No such file" in (out / "hover").read_text()
-    assert not (tmp_path / "marker").exists()
+def test_what_a_build_makes_is_never_set_user_id(tmp_path: Path) -> None:
+    """Nor is it a directory that the builder cannot remove. Seen to fail: root's build had a program of mode 4755."""
+    script = "cp /bin/true /out/made && chmod 4755 /out/made && mkdir -p /out/a/b && chmod 0 /out/a"
+    runtime.command(tmp_path, HOST, ["sh", "-c", script])
+    assert [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("made", "a")] == [0o755, 0o700]
+
+
+SOURCES = {"block": "hover.c", "ert": "generated/hover.c", "fmu": "unit/sources/hover.c", "make": "main.c"}
+"""A file of each kind of app that the compiler reads."""
+STEALS = {"a header": '#include "{key}"', "bytes": '__asm__(".incbin \\"{key}\\"");'}
+
+
+@pytest.mark.parametrize("steal", STEALS)
+@pytest.mark.parametrize("kind", SOURCES)
+def test_sources_have_the_compiler_read_no_key(
+    planted: None, tmp_path: Path, board: Board, kind: str, steal: str
+) -> None:
+    """The compiler of this computer reads it, so that the test can fail."""
+    scaffold.create(kind, "hover", tmp_path)
+    source, line = tmp_path / "hover" / SOURCES[kind], STEALS[steal].format(key=tmp_path / "keys/release")
+    source.write_text(f"{source.read_text()}\n{line}\n")
+    with pytest.raises(UserError, match="release") as refused:
+        builder.build(app.load(tmp_path / "hover"), board, tmp_path / "out")
+    assert SECRET not in str(refused.value)
+    assert not any(SECRET in path.read_text(errors="replace") for path in tmp_path.glob("out/**/*") if path.is_file())
+    (tmp_path / "plain.c").write_text(f"{line}\n")
+    argv = ["cc", "-c", "-o", str(tmp_path / "plain.o"), str(tmp_path / "plain.c")]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    made = (tmp_path / "plain.o").read_bytes() if done.returncode == 0 else b""
+    assert SECRET in done.stderr or SECRET.encode() in made
+
+
+MEMBERS = {
+    "a path that leads out": "../../keys/marker.c",
+    "a path from the root": "{keys}/marker.c",
+    "a link": "link.c",
+}
+UNPACKERS: dict[str, Callable[[Path, Path], object]] = {
+    "model": lambda archive, place: imported.create(archive, "hover", [HOST], parent=place / "a/b"),
+    "unit": lambda archive, place: fmu.unpacked(archive.parent, archive.name, place / "a/b"),
+}
+
+
+@pytest.mark.parametrize("member", MEMBERS)
+@pytest.mark.parametrize("kind", UNPACKERS)
+def test_an_archive_writes_and_links_nowhere_else(planted: None, tmp_path: Path, kind: str, member: str) -> None:
+    """An unpacker that writes each member to its path does, so that the test can fail."""
+    (tmp_path / "a/b").mkdir(parents=True)
+    (tmp_path / "in").mkdir()
+    name = MEMBERS[member].format(keys=tmp_path / "keys")
+    with zipfile.ZipFile(tmp_path / "in/hover.fmu", "w") as archive:
+        info = zipfile.ZipInfo(name)
+        info.external_attr = (stat.S_IFLNK if member == "a link" else stat.S_IFREG | 0o644) << 16
+        archive.writestr(info, str(tmp_path / "keys/release"))
+    with contextlib.suppress(UserError):
+        UNPACKERS[kind](tmp_path / "in/hover.fmu", tmp_path)
+    assert [path.name for path in (tmp_path / "keys").iterdir()] == ["release"]
+    assert not any(path.is_symlink() for path in tmp_path.rglob("*"))
+    plain = tmp_path / "a/b" / name
+    plain.unlink(missing_ok=True)
+    plain.symlink_to(tmp_path / "keys/release") if member == "a link" else plain.write_text("")
+    assert plain.is_symlink() or len(list((tmp_path / "keys").iterdir())) == 2
 
 
 def test_no_file_behind_a_link_is_removed_for_a_program(board: Board, tmp_path: Path) -> None:
@@ -190,7 +285,7 @@ LINKS = {
 
 @pytest.mark.parametrize(("commands", "keys"), LINKS.values(), ids=LINKS.keys())
 def test_what_a_build_leaves_is_read_where_it_is_a_file_of_its_own(
-    made: Callable[..., Path], tmp_path: Path, defines: list[str], commands: str, keys: str
+    made: Callable[..., Path], tmp_path: Path, planted: None, commands: str, keys: str
 ) -> None:
     """Seen to fail: the key went to the robot as the program, and as a directory's file."""
     recipe = commands.format(key=tmp_path / "keys/release", keys=tmp_path / "keys")
@@ -384,20 +479,28 @@ case " $* " in *" --reuid=app --regid=app --clear-groups --bounding-set=-all --i
 while case $1 in --*) ;; *) false ;; esac; do shift; done
 AS=app exec "$@"
 """
+ALONE = """#!/bin/sh
+read -r score </proc/self/oom_score_adj
+[ "$score" = 1000 ] || exit 1
+case " $* " in *" --net --pid --fork --kill-child "*) ;; *) exit 1 ;; esac
+while case $1 in --*) ;; *) false ;; esac; do shift; done
+ALONE=alone exec "$@"
+"""
 RECORDS = """#!/bin/sh
-echo "{name} as ${{AS:-root}}" >>{log}
+echo "{name} as ${{AS:-root}} ${{ALONE:-among others}}" >>{log}
 exit 1
 """
 
 
 def test_a_robot_runs_no_code_of_an_app_as_root_to_check_it(tmp_path: Path) -> None:
-    """The robot's script, with programs in place of its own that record who starts them, and refuse the app.
+    """The robot's script, with programs in place of its own that record who starts them, and reject the app.
 
-    Seen to fail: `flotilla-run as root`, so a plug-in's constructor was root; root's `cat` followed an app's link."""
+    Seen to fail: `flotilla-run as root`, so a plug-in's constructor was root; root's `cat` followed an app's link;
+    `among others`: the code had the robot's network, and its processes were left."""
     log, programs, apps = tmp_path / "log", tmp_path / "bin", tmp_path / "apps"
     programs.mkdir()
     texts = {name: RECORDS.format(name=name, log=log) for name in ("flotilla-run", "ldd", "head", "cat")}
-    for name, text in {**texts, "setpriv": AS_APP}.items():
+    for name, text in {**texts, "setpriv": AS_APP, "unshare": ALONE}.items():
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
     script = remote.SCRIPT.read_text().replace("/data/apps", str(apps)).replace("/var/lib/flotilla-apps", str(apps))
@@ -411,4 +514,4 @@ def test_a_robot_runs_no_code_of_an_app_as_root_to_check_it(tmp_path: Path) -> N
         argv = ["sh", "-c", script, "flotilla", *words]
         done = subprocess.run(argv, env=environment, input=archive.getvalue(), capture_output=True, check=False)
         assert done.returncode, done.stderr
-    assert log.read_text().splitlines() == ["flotilla-run as app", "head as app"]
+    assert log.read_text().splitlines() == ["flotilla-run as app alone", "head as app alone"]

@@ -205,10 +205,10 @@ def test_a_refused_sandbox_has_the_same_remedies(host: Path, monkeypatch: pytest
     (host / "proc/sys/user").mkdir(parents=True)
     (host / "proc/sys/user/max_user_namespaces").write_text("0\n")
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    said = sandbox.refusal("bwrap: Creating new namespace failed: No space left on device\n")
+    said = sandbox.refusal("bwrap: Creating new namespace failed: No space left on device\n", sandbox.CHECK)
     assert "sudo tee -a /etc/sysctl.d/60-flotilla.conf" in str(said)
     assert "apt-get install --no-install-recommends bubblewrap" in str(
-        sandbox.refusal("prlimit: failed to execute bwrap: No such file or directory\n")
+        sandbox.refusal("bwrap: is missing\n", sandbox.CHECK)
     )
 
 
