@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
@@ -116,6 +117,14 @@ def usable(private: Path) -> Path:
         f"{paths.shown(private)}: the private key is not on this computer, and no ssh-agent has it; load it "
         "(`ssh-add FILE`, or `ssh-add -s LIBRARY` for a token), run this command where the key is, or bring it: "
         "`make restore-keys`"
+    )
+
+
+def copy_for_image(robot: Robot, to: Path) -> None:
+    """Copy what the image of a robot depends on: of all SSH keys' private halves that of its host key alone."""
+    own = f"{robot.name}_ed25519"
+    shutil.copytree(
+        paths.KEYS, to, ignore=lambda _, names: [each for each in names if f"{each}.pub" in names and each != own]
     )
 
 
