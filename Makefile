@@ -321,8 +321,8 @@ station = $(call option,--seconds,SECONDS) $(call option,--live-address,ADDRESS)
 record: | setup-station ## record telemetry to an MCAP file | [OUT=file] [SECONDS=60] [PORT=8765] [ADDRESS=127.0.0.1]
 	$(Q)$(FLOTILLA) record $(station) $(call option,--live,PORT) $(call each_given,OUT)
 
-live: | setup-station ## stream live telemetry to Foxglove | [PORT=8765] [ADDRESS=127.0.0.1] [SECONDS=60] [OUT=file]
-	$(Q)$(FLOTILLA) live $(station) $(call option,--record,OUT) $(call each_given,PORT)
+live: | setup-station ## stream live telemetry to Foxglove | [PORT=8765] [ADDRESS=127.0.0.1] [ORIGIN=http://localhost:8080] [SECONDS=60] [OUT=file]
+	$(Q)$(FLOTILLA) live $(station) $(call option,--record,OUT) $(call option,--origin,ORIGIN) $(call each_given,PORT)
 
 top: | setup-station ## show a live telemetry table; start and stop tasks by key | [ASK=1] [SECONDS=60] [OUT=file] [PORT=8765] [ADDRESS=127.0.0.1]
 	$(Q)$(FLOTILLA) top $(station) $(if $(filter-out 0,$(ASK)),--ask) $(call option,--record,OUT) $(call option,--live,PORT)

@@ -33,10 +33,11 @@ def rename_files(files: Sequence[Path], place: Path) -> None:
     sync_names(place)
 
 
-def write(file: Path, content: str | bytes) -> Path:
-    """Write a small file in one go, in the place of the one that is there; the file."""
+def write(file: Path, content: str | bytes, *, private: bool = False) -> Path:
+    """Write a small file in one go, in the place of the one that is there; the file. `private`: for its owner alone."""
     beside = file.with_name(f".{file.name}.{os.getpid()}-{threading.get_ident()}")  # others may write the same now
     try:
+        beside.touch(0o600 if private else 0o666)
         beside.write_bytes(content.encode() if isinstance(content, str) else content)
         return rename(beside, file)
     finally:

@@ -70,7 +70,7 @@ def variables(fleet: Fleet, robot: Robot) -> dict[str, object]:
         "host_keys": host_keys,
         "revoked_keys": keys.revoked(),
         "host_public_key": host_keys[robot.name],
-        "host_private_key": keys.of_robot(robot).read_text(),
+        "host_private_key": keys.here(keys.of_robot(robot)).read_text(),
         "message_keys": shared_keys.lines(robot, hosts(fleet)),
         "time_key": shared_keys.time,
         "operator_key": keys.public(keys.operator()),

@@ -1,10 +1,10 @@
-"""All keys of a fleet in one file, encrypted by a passphrase: Ansible's vault (AES-256, HMAC-SHA256, PBKDF2) of a tar.
+"""All keys of a fleet in one file: a tar, encrypted by a passphrase in the format age (age.py).
 
-`ansible-vault` asks for the passphrase on the terminal, or reads it from a file. The keys in the clear are never on a
-disk but where they belong.
+The passphrase comes from the terminal or from a file. The keys in the clear are never on a disk but where they belong.
+Earlier backups are vaults of Ansible (PBKDF2 with 10,000 rounds), which a restore still reads.
 
-Whoever knows the passphrase can write a backup, so a restore unpacks nothing as the tar says: names, kinds and sizes
-are checked here, and what is written is a private file in the directory of keys.
+Everybody who knows the passphrase can write a backup, so a restore does not unpack the tar by its own words: names,
+kinds and sizes are checked here, and each file becomes a private one in the directory of keys.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ from pathlib import Path
 
 from flotilla.common import ansible, durable, paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import keys
+from flotilla.fleet import age, keys, passphrases
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 """Of a key or a list: in no other directory, and no file that begins with a dot."""
 _FILE_BYTES = 1 << 20
 """A key has hundreds, a list of keys some ten thousand."""
 _MOST_FILES = 10_000
+_VAULT = b"$ANSIBLE_VAULT;"
+"""How an earlier backup begins."""
 
 
 def backup(to: Path, password: Path | None) -> int:
@@ -42,13 +44,11 @@ def backup(to: Path, password: Path | None) -> int:
             if wrong := _wrong(member):
                 raise UserError(f"{paths.shown(paths.KEYS / name)}: {wrong}; move it away, or give it another name")
             archive.addfile(member, io.BytesIO(data))
-    beside = to.with_name(f".{to.name}.new")
+    data = age.encrypt(content.getvalue(), passphrases.read(password, new=True))
     try:
-        _vault("encrypt", password, content.getvalue(), beside)
-        beside.chmod(0o600)
-        durable.rename(beside, to)
-    finally:
-        beside.unlink(missing_ok=True)
+        durable.write(to, data, private=True)
+    except OSError as error:
+        raise UserError(f"OUT={to}: {error.strerror}; give a file in a directory that you may write to") from error
     return len(files)
 
 
@@ -56,7 +56,7 @@ def restore(source: Path, password: Path | None) -> int:
     """Put keys back where there are none; how many files. UserError, and nothing is changed, where others are."""
     if not source.is_file():
         raise UserError(f"{paths.shown(source)}: no such file; `make backup-keys OUT=FILE` makes one")
-    files = _unpacked(source, _vault("decrypt", password, source.read_bytes()))
+    files = _unpacked(source, _decrypted(source, password))
     with keys.alone():  # nobody makes a key meanwhile that the backup has
         if others := [file.name for file in _files(paths.KEYS) if file.read_bytes() != files.get(file.name)]:
             raise UserError(
@@ -114,14 +114,22 @@ def _files(directory: Path) -> list[Path]:
     return sorted(file for file in directory.iterdir() if file.is_file() and not file.name.startswith("."))
 
 
-def _vault(what: str, password: Path | None, content: bytes, out: Path | None = None) -> bytes:
-    """What `ansible-vault` makes of its standard input."""
+def _decrypted(source: Path, password: Path | None) -> bytes:
+    data = source.read_bytes()
+    if data.startswith(_VAULT):
+        return _of_vault(source, data, password)
+    try:
+        return age.decrypt(data, passphrases.read(password, new=False))
+    except age.DecryptionError as error:
+        raise UserError(f"{paths.shown(source)}: no backup of keys: {error}") from None
+
+
+def _of_vault(source: Path, data: bytes, password: Path | None) -> bytes:
     secret = ["--vault-password-file", str(password.resolve())] if password else ["--ask-vault-pass"]
-    if password and not password.is_file():
-        raise UserError(f"{password}: no such file; it holds the passphrase of the backup")
-    argv = [str(Path(sys.executable).with_name("ansible-vault")), what, *secret, "--output", str(out or "-"), "-"]
-    done = subprocess.run(argv, input=content, env=ansible.environment(), capture_output=True, check=False)
+    argv = [str(Path(sys.executable).with_name("ansible-vault")), "decrypt", *secret, "--output", "-", "-"]
+    done = subprocess.run(argv, input=data, env=ansible.environment(), capture_output=True, check=False)
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip()
-        raise UserError(f"ansible-vault {what}: {said}")
+        reason = done.stderr.decode(errors="replace").strip()
+        raise UserError(f"{paths.shown(source)}: ansible-vault decrypt: {reason}")
+    sys.stderr.write(f"{paths.shown(source)}: has the earlier, weaker encryption; `make backup-keys` makes a new one\n")
     return done.stdout

@@ -3,7 +3,7 @@
 | file | what |
 |---|---|
 | `robotN_ed25519` | host key of a robot, pinned everywhere |
-| `operator_ed25519` | what every robot admits; it may have a passphrase, if an agent has it |
+| `operator_ed25519` | every robot admits it; it may have a passphrase, if an agent has it |
 | `NAME_ed25519.retired` | the former one, accepted until it is retired: public of a robot, private of the operator |
 | `revoked_keys` | public host keys that nobody accepts any more, a line each with the robot's name |
 | `operator_authority` | what signs certificates of further operators: operators.py |
@@ -12,12 +12,16 @@
 | `fleet_secret` | where keys of messages come from: message_keys.py |
 | `dds_authority` | what signs who may send which DDS topics: dds_security.py |
 | `known_hosts` | what of that `ssh` on this computer accepts; written anew when it differs |
+
+Beside each SSH key is its public half, `NAME.pub`. Where that is alone, the private half is elsewhere: in an agent, on
+a hardware token, or on another computer. Nothing makes another one in its place.
 """
 
 from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
@@ -26,22 +30,26 @@ from pathlib import Path
 
 from flotilla.common import durable, paths
 from flotilla.common.errors import UserError
+from flotilla.fleet import ssh_signatures
 from flotilla.fleet.model import Fleet, Robot
 
 _OPERATOR = "operator_ed25519"
 
 
 def make(name: str, comment: str) -> Path:
-    """The private key `name`, made if there is none."""
+    """The private key `name`, made if neither it nor its public half is there."""
     path = paths.KEYS / name
-    if not path.exists():
+    if not _public_file(path).exists():
         with alone():  # provisioning renders robots' files in processes of their own
-            if not path.exists():
+            if not path.exists() and not _public_file(path).exists():
                 _generate(path, comment)
+            elif not _public_file(path).exists():  # power failed between the two renames
+                durable.write(_public_file(path), _public_half(path, comment))
     return path
 
 
 def _generate(path: Path, comment: str) -> None:
+    """The public half gets its name last: alone it means that the private one is elsewhere."""
     beside = path.with_name(f".{path.name}.new")
     beside.unlink(missing_ok=True)
     argv = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", comment, "-f", str(beside)]
@@ -49,8 +57,18 @@ def _generate(path: Path, comment: str) -> None:
         subprocess.run(argv, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     except subprocess.CalledProcessError as error:
         raise UserError(f"cannot make the key {paths.shown(path)}: {error.stderr.strip()}") from error
-    durable.rename(_public_file(beside), _public_file(path))
     durable.rename(beside, path)
+    durable.rename(_public_file(beside), _public_file(path))
+
+
+def _public_half(private: Path, comment: str) -> str:
+    """Of a key whose public half is missing. Such a key is new, so it has no passphrase yet."""
+    argv = ["ssh-keygen", "-y", "-P", "", "-f", str(private)]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    if done.returncode:
+        file = paths.shown(private)
+        raise UserError(f"{file}.pub is missing: {done.stderr.strip()}; make it: `ssh-keygen -y -f {file} >{file}.pub`")
+    return f"{' '.join(done.stdout.split()[:2])} {comment}\n"
 
 
 @contextmanager
@@ -72,6 +90,42 @@ def public(private: Path) -> str:
 
 def _public_file(private: Path) -> Path:
     return private.with_name(private.name + ".pub")
+
+
+def here(private: Path) -> Path:
+    """The private key's file; UserError where it is elsewhere."""
+    if not private.exists():
+        raise UserError(
+            f"{paths.shown(private)}: the private key is not on this computer; run this command where the key is, or "
+            "bring it: `make restore-keys`. If it is lost, remove "
+            f"{paths.shown(_public_file(private))}, and a new key is made"
+        )
+    return private
+
+
+def usable(private: Path) -> Path:
+    """The file by which SSH's programs use a key: the private one, or the public half of a key in an agent.
+
+    UserError where the private half is neither here nor in an agent.
+    """
+    public_file = _public_file(private)
+    if private.exists():
+        return private
+    if ssh_signatures.is_in_agent(public(private)):
+        return public_file
+    raise UserError(
+        f"{paths.shown(private)}: the private key is not on this computer, and no ssh-agent has it; load it "
+        "(`ssh-add FILE`, or `ssh-add -s LIBRARY` for a token), run this command where the key is, or bring it: "
+        "`make restore-keys`"
+    )
+
+
+def copy_for_image(robot: Robot, to: Path) -> None:
+    """Copy what the image of a robot depends on: of all SSH keys' private halves that of its host key alone."""
+    own = f"{robot.name}_ed25519"
+    shutil.copytree(
+        paths.KEYS, to, ignore=lambda _, names: [each for each in names if f"{each}.pub" in names and each != own]
+    )
 
 
 # --- robots' host keys ---
@@ -161,21 +215,23 @@ def former_operator() -> Path | None:
 
 def rotate_operator_key() -> None:
     """A new operator's key. The former one is kept, because robots admit it until they are provisioned."""
-    now, former = operator(), _former()
+    now, former = here(operator()), _former()
     if former.exists():
         raise UserError(
             f"{paths.shown(former)}: an earlier rotation has not ended; `make provision`, then "
             "`make rotate-key KEY=operator RETIRE=1`"
         )
     durable.write(_public_file(former), _public_file(now).read_text())
-    durable.rename(now, former)  # from here on whoever asks first makes a new one
+    _public_file(now).unlink()  # first: alone it means that the private half is elsewhere
+    durable.rename(now, former)  # from here on the next use makes a new one
     operator()
 
 
 def retire_operator_key() -> None:
     """Nothing on this computer uses the former key any more."""
     if former := former_operator():
-        _remove(former)
+        former.unlink()
+        _public_file(former).unlink(missing_ok=True)
 
 
 def _former() -> Path:
@@ -186,8 +242,9 @@ def _former() -> Path:
 
 
 def _remove(private: Path) -> None:
-    private.unlink()
+    """The public half first: alone it means that the private one is elsewhere."""
     _public_file(private).unlink(missing_ok=True)
+    private.unlink(missing_ok=True)
 
 
 def write_once(file: Path, text: str) -> None:

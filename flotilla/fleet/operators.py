@@ -194,7 +194,9 @@ def _certificate(key_file: Path, admission: Admission) -> str:
     with tempfile.TemporaryDirectory(prefix="operator-") as directory:
         public = Path(directory) / "key.pub"
         public.write_text(f"{admission.key} {admission.name}\n")
-        argv = ["ssh-keygen", "-q", "-s", str(authority()), "-I", admission.name, "-n", _PRINCIPAL, "-V", valid]
+        signer = keys.usable(authority())
+        by_agent = ["-U"] if signer.suffix == ".pub" else []
+        argv = ["ssh-keygen", "-q", *by_agent, "-s", str(signer), "-I", admission.name, "-n", _PRINCIPAL, "-V", valid]
         argv += ["-z", str(admission.serial), "-O", "clear", "-O", "permit-pty"]
         if admission.sources:
             argv += ["-O", f"source-address={','.join(admission.sources)}"]

@@ -12,13 +12,28 @@ from flotilla.common.errors import UserError
 _SIGNER = "signer"
 
 
-def sign(content: bytes, private: Path, namespace: str) -> bytes:
-    """By a key's file. `namespace`: what the signature is for; it is none for anything else."""
-    argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", namespace, "-f", str(private)]
+def is_in_agent(public: str) -> bool:
+    """Whether an agent (`SSH_AUTH_SOCK`) has the private half of a public key, given without comment."""
+    done = subprocess.run(["ssh-add", "-L"], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    return done.returncode == 0 and public in {" ".join(line.split()[:2]) for line in done.stdout.splitlines()}
+
+
+def sign(content: bytes, key: Path, namespace: str) -> bytes:
+    """By a private key's file, or a public one's if an agent has the private half. `namespace`: the only use of the
+    signature."""
+    argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", namespace, "-f", str(key)]
     done = subprocess.run(argv, input=content, capture_output=True, check=False)
     if done.returncode:
         raise UserError(f"{' '.join(argv)} failed: {done.stderr.decode(errors='replace').strip()}")
     return done.stdout
+
+
+def sign_by_agent(content: bytes, public: str, namespace: str) -> bytes:
+    """By a key of which the agent has the private half."""
+    with tempfile.NamedTemporaryFile("w", prefix="signer-", suffix=".pub") as file:
+        file.write(f"{public}\n")
+        file.flush()
+        return sign(content, Path(file.name), namespace)
 
 
 def is_signed(content: bytes, signature: Path, public: Sequence[str], namespace: str) -> bool:

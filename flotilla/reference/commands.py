@@ -8,6 +8,7 @@ import re
 from itertools import groupby
 
 from flotilla.cli.command import Command
+from flotilla.cli.key_access import PRIVATE_KEYS
 from flotilla.cli.main import commands, parser
 from flotilla.common import paths
 from flotilla.reference.markdown import MADE, code, literal, table
@@ -20,13 +21,28 @@ Both end with a status other than 0 and a message on standard error where someth
 """
 
 
+_KEYS = """## Private keys that commands read
+
+`backup-keys` and `restore-keys` read all of them. Commands that are not in the table read none.
+
+"""
+
+
 def page() -> str:
     known = sorted(commands(), key=lambda command: command.group)
     sections = [
         f"\n### {group}\n{''.join(map(_command, members))}"
         for group, members in groupby(known, lambda command: command.group)
     ]
-    return f"{HEAD}\n## Targets of make\n{_targets()}\n## Commands of flotilla\n{''.join(sections)}"
+    return f"{HEAD}\n## Targets of make\n{_targets()}\n{_KEYS}{_keys()}\n## Commands of flotilla\n{''.join(sections)}"
+
+
+def _keys() -> str:
+    head = ("file in `ansible/keys/`", "use", "commands that read it", "an ssh-agent may have it")
+    return table(head, [
+        (code(key.name), key.use, ", ".join(map(code, sorted(key.commands))), "yes" if key.in_agent else "no")
+        for key in PRIVATE_KEYS
+    ])  # fmt: skip
 
 
 def _command(command: Command) -> str:

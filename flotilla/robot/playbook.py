@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flotilla.common import ansible, paths, progress
 from flotilla.common.errors import UserError
-from flotilla.fleet import inventory
+from flotilla.fleet import inventory, keys
 
 ANSIBLE = paths.PROJECT / "ansible"
 
@@ -22,6 +22,7 @@ def play(playbook: str, *, robot: int | None, guests: bool, words: Sequence[str]
         raise UserError(f"{playbook}: ansible/ has no such playbook; there are {there}")
     if guests and not paths.GUESTS.exists():
         raise UserError(f"{paths.shown(paths.GUESTS)} is missing: no virtual fleet runs; start one: make fleet N=4")
+    keys.usable(keys.operator())  # before Ansible, whose messages name no remedy
     programs = Path(sys.executable).parent
     argv = [str(programs / "ansible-playbook")]
     argv += [word for place in inventory.layers(paths.INVENTORY) for word in ("-i", str(place))]

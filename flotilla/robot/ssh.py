@@ -73,9 +73,10 @@ def options(robot: Robot, *, former: bool = True) -> list[str]:
     """How every `ssh` to a robot proves who is who: the operator's key, the robot's pinned host key, nothing asked.
     `former`: while the operator's key is rotated, the one before will do, too."""
     key, known_hosts = paths.KEYS / "operator_ed25519", paths.KEYS / "known_hosts"
-    for file in (key, known_hosts):
-        if not file.exists():
+    for file, kept in ((key, (key, key.with_name(f"{key.name}.pub"))), (known_hosts, (known_hosts,))):
+        if not any(each.exists() for each in kept):
             raise UserError(f"{paths.shown(file)} is missing; `make image ROBOT={robot.number}` makes the keys")
+    key = keys.usable(key)
     settings = {
         "User": "robot",
         "IdentityFile": str(key),

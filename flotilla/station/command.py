@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
     keys = {}
     with contextlib.ExitStack() as during:
         if arguments.live is not None:
-            receiver.sinks.append(Server(known, arguments.live_address, arguments.live))
+            receiver.sinks.append(Server(known, arguments.live_address, arguments.live, arguments.origin))
             doing.append("serving")
         if arguments.record:
             receiver.sinks.append(Recorder(known, arguments.record))
@@ -113,6 +113,9 @@ def _live_option(parser: argparse.ArgumentParser) -> None:
 
 def _common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--live-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
+    parser.add_argument(
+        "--origin", action="append", default=[], help="a web page that may connect, http://localhost:8080 for instance"
+    )
     parser.add_argument("--seconds", type=float, help=f"end after so many ({TOP_S:g} for top alone on no terminal)")
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
     parser.add_argument("--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)")

@@ -15,6 +15,7 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 from flotilla.common.errors import UserError
 from flotilla.fleet.drawings import Drawing
 from flotilla.station import schema
+from flotilla.station.origins import FOXGLOVE, Relay, hidden_address
 from flotilla.station.recording import Value
 from flotilla.station.telemetry import Stream
 
@@ -34,9 +35,12 @@ class _Listener(ServerListener):
 
 
 class Server:
-    """Serves the messages of `known` at an address of this computer; a sink of the receiver. `port` 0: any."""
+    """Serves the messages of `known` at an address of this computer; a sink of the receiver. `port` 0: any.
 
-    def __init__(self, known: Iterable[Stream], address: str, port: int) -> None:
+    `origins`: web pages that may connect besides Foxglove's.
+    """
+
+    def __init__(self, known: Iterable[Stream], address: str, port: int, origins: Iterable[str] = ()) -> None:
         if not 0 <= port < 1 << 16:
             raise UserError(f"TCP port {port}: there is none; give one from 1 to 65535: PORT=")
         self._context = foxglove.Context()  # which channels and server do not hold on to
@@ -52,15 +56,13 @@ class Server:
                     topic, schema=described, message_encoding=schema.ENCODING, context=self._context
                 )
                 channels.append((channel, own))
-        try:
-            self._server = foxglove.start_server(
-                name="flotilla", host=address, port=port, server_listener=self._listener, context=self._context
-            )
-        except RuntimeError as error:
-            reason = str(error).removeprefix("FoxgloveError: Failed to bind port: ")
-            remedy = "give another port or address of this computer: PORT= ADDRESS="
-            raise UserError(f"TCP port {port} of {address}: {reason}; {remedy}") from error
-        self._url = f"ws://{address}:{self._server.port}"
+        self._relay = Relay(address, port, {*FOXGLOVE, *origins})
+        hidden = hidden_address()
+        self._server = foxglove.start_server(
+            name="flotilla", host=hidden, port=0, server_listener=self._listener, context=self._context
+        )
+        self._relay.begin((hidden, self._server.port))
+        self._url = f"ws://{address}:{self._relay.port}"
         sys.stderr.write(f"serving at {self._url}; in Foxglove: Open connection, Foxglove WebSocket\n")
         sys.stderr.flush()
 
@@ -74,5 +76,9 @@ class Server:
         """Nothing to do: every message leaves at once."""
 
     def end(self) -> str:
+        self._relay.end()
         self._server.stop()
-        return f"{self._url}: {self._served} messages served, {len(self._listener.clients)} clients"
+        rejected = (
+            f", {self._relay.rejected} connections of web pages rejected (ORIGIN=)" if self._relay.rejected else ""
+        )
+        return f"{self._url}: {self._served} messages served, {len(self._listener.clients)} clients{rejected}"

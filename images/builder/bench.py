@@ -20,6 +20,7 @@ from pathlib import Path
 
 from flotilla.common import cache, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.fleet import keys as fleet_keys
 from flotilla.fleet.model import Fleet, Robot
 from images.builder import bench_mkosi, build, pool, rootfs, tools
 from images.builder.lock import Lock, read_lock
@@ -161,7 +162,7 @@ def _many(work: Path, first: Robot) -> Callable[[], int]:
                 f"{paths.shown(work)}: {_MANY} cards need {progress.size(needed)}, and {progress.size(free)} are free; "
                 "make room, or let BUILD= name a folder on a larger disk"
             )
-        shutil.copytree(paths.KEYS, keys)
+        fleet_keys.copy_for_image(first, keys)
         argv = [sys.executable, "-m", "images.builder.bench_robots", str(first.number), str(_MANY)]
         _command(argv, BUILD=str(work), KEYS=str(keys))
         made = list(images.glob("measured*.img"))

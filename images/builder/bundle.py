@@ -40,7 +40,7 @@ def file_of(board: str) -> Path:
 
 
 def make(fleet: Fleet, board: Board, signatures: Sequence[Path], expires: date | None = None) -> Path:
-    """Make the bundle of a board, signed by the keys that are here and by `signatures` made elsewhere.
+    """Make the bundle of a board, signed by the keys here, by those in an agent, and by `signatures` made elsewhere.
 
     `expires`: its last day, in UTC. By default that of the manifest that was signed elsewhere, or the inventory's
     `lifetime_days` from today on. Raises UserError if that day is over.
@@ -140,6 +140,8 @@ def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> di
         private = paths.KEYS / f"{key['name']}_ed25519"
         if private.exists():
             signed[key["name"]] = ssh_signatures.sign(text.read_bytes(), private, release_keys.NAMESPACE)
+        elif ssh_signatures.is_in_agent(key["key"]):
+            signed[key["name"]] = ssh_signatures.sign_by_agent(text.read_bytes(), key["key"], release_keys.NAMESPACE)
     for file in elsewhere:
         name = next((key["name"] for key in trusted["keys"] if signed_by(text, file, key)), None)
         if name is None:
@@ -151,7 +153,8 @@ def _signatures(text: Path, releases: Releases, elsewhere: Sequence[Path]) -> di
     if len(signed) < trusted["signatures"]:
         names = ", ".join(key["name"] for key in trusted["keys"])
         raise UserError(
-            f"{paths.shown(text)}: {len(signed)} of {trusted['signatures']} signatures; have more of {names} sign it: "
+            f"{paths.shown(text)}: {len(signed)} of {trusted['signatures']} signatures, by keys of "
+            f"{paths.shown(paths.KEYS)} and of the ssh-agent; load a key (`ssh-add`), or have more of {names} sign it: "
             f"`ssh-keygen -Y sign -n {release_keys.NAMESPACE} -f KEY {text.name}`, then give the signature files: "
             'SIGNATURES="FILE ..."'
         )

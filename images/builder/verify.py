@@ -29,6 +29,7 @@ from pathlib import Path
 
 from flotilla.common import cache, namespace, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.fleet import keys
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.model import Board, Fleet, Robot
 from images.builder import build, compare, kernel, pool, tools
@@ -179,7 +180,7 @@ def _prepare(directory: Path, board: Board, robot: Robot, *, plant: bool) -> tup
     if plant:
         overlay = directory / "checkout" / paths.OVERLAY.relative_to(paths.PROJECT)
         (overlay / _PLANTED).write_text(f"{datetime.now(UTC)}\n")
-    shutil.copytree(paths.KEYS, directory / "keys")
+    keys.copy_for_image(robot, directory / "keys")
     lock, tools_lock = board_lock(board), read_lock("tools")
     (directory / "build/pool").mkdir(parents=True)
     (directory / "build/cache").mkdir()

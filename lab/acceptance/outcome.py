@@ -79,8 +79,13 @@ def write(made: Acceptance) -> Path:
     directory().mkdir(parents=True, exist_ok=True)
     file = directory() / f"{made.name}.json"
     content = (json.dumps(made.model_dump(mode="json"), indent=1, sort_keys=True) + "\n").encode()
-    durable.write(signature_of(file), ssh_signatures.sign(content, keys.operator(), NAMESPACE))
+    durable.write(signature_of(file), signature(content))
     return durable.write(file, content)
+
+
+def signature(content: bytes) -> bytes:
+    """Of a report, by the operator's key."""
+    return ssh_signatures.sign(content, keys.usable(keys.operator()), NAMESPACE)
 
 
 def signature_of(file: Path) -> Path:

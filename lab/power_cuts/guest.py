@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from flotilla.common import paths
-from flotilla.fleet import release_keys
+from flotilla.fleet import keys, release_keys, ssh_signatures
 from images.builder import bundle, card, environment_block
 from images.builder.tools import Tools, command
 from lab.power_cuts import releases
@@ -226,7 +226,6 @@ def _manifest(release: Held, directory: Path) -> bytes:
     (directory / "slot.img").write_bytes(release.content)
     (directory / "header.json").write_text(json.dumps(dict(release.header)))
     text = bundle.manifest_of(directory, {})
-    key = paths.KEYS / "release_ed25519"
-    argv = ["ssh-keygen", "-Y", "sign", "-q", "-n", release_keys.NAMESPACE, "-f", str(key)]
-    signature = subprocess.run(argv, input=text, capture_output=True, check=True).stdout
+    key = keys.usable(paths.KEYS / "release_ed25519")
+    signature = ssh_signatures.sign(text, key, release_keys.NAMESPACE)
     return json.dumps({"manifest": text.decode(), "signatures": [signature.decode()]}).encode()

@@ -54,7 +54,7 @@ ELSEWHERE = {
         "needs a colleague's key, and changes the keys; unit/test_operators.py does the same with a copy",
     ),
     **dict.fromkeys(
-        ("make backup-keys OUT=fleet-keys.vault", "make restore-keys FILE=fleet-keys.vault"),
+        ("make backup-keys OUT=fleet-keys.age", "make restore-keys FILE=fleet-keys.age"),
         "asks for a passphrase; unit/test_keys.py",
     ),
     "make fleet N=2 LINK=ibss": "operations.md starts a fleet; test_radio_cell.py has guests in a cell",

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
@@ -137,6 +138,40 @@ def test_a_client_gets_what_was_sent(fleet: Path) -> None:
     assert f": {len(shown) + 1} messages served, 1 clients" in said
     taken = f"{robots.sent['control'] - 1} received, 0 of a wrong length, 0 forged and 1 replayed left out"
     assert f"{TOPIC}: {taken}" in said, "the first one is answered by a challenge"
+
+
+def opens(port: int, *origins: str) -> bool:
+    """Whether a client connects that sends these Origins, as a browser does."""
+    headers = [("Origin", origin) for origin in origins]
+    protocols = [Subprotocol("foxglove.sdk.v1")]
+    try:
+        with connect(f"ws://127.0.0.1:{port}", subprotocols=protocols, additional_headers=headers):
+            return True
+    except InvalidStatus as error:
+        return error.response.status_code != 403
+
+
+def test_a_foreign_web_page_reads_nothing(fleet: Path) -> None:
+    """Foxglove's pages connect, programs, and a page that is named. Seen to fail: every page connected."""
+    own = "http://localhost:8080"
+    with station(fleet, "live", "0", "--origin", own) as process:
+        port = port_of(process)
+        assert opens(port)
+        for origin in ("https://app.foxglove.dev", "file://", own):
+            assert opens(port, origin), origin
+        foreign = ["https://evil.example", "null", "", "http://localhost:8081", f"http://127.0.0.1:{port}",
+                   "https://app.foxglove.dev.evil.example", "http://app.foxglove.dev"]  # fmt: skip
+        for origin in foreign:
+            assert not opens(port, origin), origin
+        assert not opens(port, "https://app.foxglove.dev", "https://evil.example")
+        for request in (b"GET / HTTP/1.1\r\n\r\n", b"GET / HTTP/1.1\r\nUpgrade: h2c\r\n\r\n"):
+            with socket.create_connection(("127.0.0.1", port)) as page:
+                page.sendall(request)
+                assert page.recv(100).startswith(b"HTTP/1.1 426 ")
+        process.send_signal(signal.SIGINT)
+        output, complaints = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, complaints
+    assert f", {len(foreign) + 1} connections of web pages rejected" in output
 
 
 @pytest.mark.nightly  # what other programs must not be disturbed by; the page's own clients are tried each time

@@ -79,11 +79,12 @@ def test_a_result_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: list[str]) -> None:
-    """The private key gets its name last: without it a new pair is made. Seen to fail: neither was synced."""
+    """The public half gets its name last: alone it means that the private one is elsewhere. Seen to fail: neither was
+    synced."""
     monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
     keys.make("a", "comment")
-    public = ["fsync .a.new.pub", "replace .a.new.pub a.pub", "fsync keys"]
-    assert calls == [*public, "fsync .a.new", "replace .a.new a", "fsync keys"]
+    private = ["fsync .a.new", "replace .a.new a", "fsync keys"]
+    assert calls == [*private, "fsync .a.new.pub", "replace .a.new.pub a.pub", "fsync keys"]
     calls.clear()
     keys.write_once(tmp_path / "keys" / "b", "secret")
     assert calls == [f"fsync .b.{os.getpid()}", "link b", "fsync keys"]

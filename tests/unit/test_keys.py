@@ -13,12 +13,13 @@ import tarfile
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
+import pyrage
 import pytest
 
 from flotilla.cli import main as command_line
-from flotilla.common import paths
+from flotilla.common import ansible, paths
 from flotilla.common.errors import UserError
-from flotilla.fleet import identity, key_backup, keys
+from flotilla.fleet import age, identity, key_backup, keys, passphrases
 from flotilla.fleet.model import Fleet, Robot
 from flotilla.robot import operator_key, ssh
 from tests import terminal
@@ -190,23 +191,20 @@ def test_processes_at_once_make_one_key() -> None:
 # --- backup ---
 
 
+WORDS = "staple horse orbit vivid canoe"
+
+
+@pytest.fixture(autouse=True)
+def cheap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Backups that take no second and no 256 MiB each."""
+    monkeypatch.setattr(age, "LOG2_COST", 4)
+
+
 @pytest.fixture
 def password(tmp_path: Path) -> Path:
     file = tmp_path / "password"
-    file.write_text("correct horse\n")
+    file.write_text(f"{WORDS}\n")
     return file
-
-
-@pytest.fixture
-def in_the_clear(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Backups without Ansible's vault, which takes a second each time."""
-
-    def vault(what: str, password: Path | None, content: bytes, out: Path | None = None) -> bytes:
-        if out:
-            out.write_bytes(content)
-        return content
-
-    monkeypatch.setattr(key_backup, "_vault", vault)
 
 
 def test_keys_come_back_from_a_backup(tmp_path: Path, password: Path) -> None:
@@ -214,7 +212,8 @@ def test_keys_come_back_from_a_backup(tmp_path: Path, password: Path) -> None:
     before, out = content(), tmp_path / "keys.backup"
     assert key_backup.backup(out, password) == len(before)
     assert stat.S_IMODE(out.stat().st_mode) == 0o600
-    assert out.read_bytes().startswith(b"$ANSIBLE_VAULT;1.1;AES256\n")
+    assert out.read_bytes().startswith(b"age-encryption.org/v1\n-> scrypt ")
+    assert not [name for name, data in before.items() if data in out.read_bytes()]
     shutil.rmtree(paths.KEYS)
     assert key_backup.restore(out, password) == len(before)
     assert content() == before
@@ -222,6 +221,111 @@ def test_keys_come_back_from_a_backup(tmp_path: Path, password: Path) -> None:
     (paths.KEYS / "robot1_ed25519").unlink()
     key_backup.restore(out, password)
     assert content() == before
+
+
+def test_a_stranger_restores_keys_without_this_tool(
+    tmp_path: Path, password: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By an implementation of age that nobody here wrote, and tar."""
+    monkeypatch.undo()  # keys of the same user, and scrypt at its full cost
+    monkeypatch.setattr(paths, "KEYS", tmp_path / "keys")
+    out, elsewhere = tmp_path / "keys.age", tmp_path / "elsewhere"
+    key_backup.backup(out, password)
+    assert out.read_bytes().splitlines()[1].endswith(b" 18"), "2^18: 256 MiB for each guess"
+    elsewhere.mkdir()
+    archive = pyrage.passphrase.decrypt(out.read_bytes(), WORDS)
+    subprocess.run(["tar", "-x", "-C", elsewhere], input=archive, check=True)
+    assert {file.name: file.read_bytes() for file in elsewhere.iterdir()} == content()
+
+
+@pytest.mark.parametrize("size", [0, 1, (1 << 16) - 1, 1 << 16, (1 << 16) + 1, 3 << 16])
+def test_files_of_every_length_are_as_ages_specification_has_them(size: int) -> None:
+    data = bytes(range(256)) * (size // 256) + bytes(size % 256)
+    assert pyrage.passphrase.decrypt(age.encrypt(data, WORDS), WORDS) == data
+    assert age.decrypt(age.encrypt(data, WORDS), WORDS) == data
+
+
+def test_what_another_implementation_encrypted_is_read() -> None:
+    assert age.decrypt(pyrage.passphrase.encrypt(b"keys", WORDS), WORDS) == b"keys"
+
+
+def test_no_byte_of_an_encrypted_file_may_change() -> None:
+    data = age.encrypt(b"keys", WORDS)
+    for at in range(len(data)):
+        with pytest.raises(age.DecryptionError):
+            age.decrypt(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :], WORDS)
+        with pytest.raises(age.DecryptionError):
+            age.decrypt(data[:at], WORDS)
+    with pytest.raises(age.DecryptionError):
+        age.decrypt(data + b"\0", WORDS)
+
+
+def test_a_file_of_two_chunks_does_not_lose_one() -> None:
+    chunk = (1 << 16) + 16
+    data = age.encrypt(bytes(2 << 16), WORDS)
+    for damaged in (data[:-chunk], data[: -2 * chunk] + data[-chunk:] + data[-2 * chunk : -chunk]):
+        with pytest.raises(age.DecryptionError, match="its end is missing"):
+            age.decrypt(damaged, WORDS)
+
+
+def test_a_file_that_would_take_all_memory_is_rejected() -> None:
+    """The writer of a backup chooses scrypt's cost."""
+    data = age.encrypt(b"keys", WORDS).replace(b" 4\n", b" 30\n", 1)
+    with pytest.raises(age.DecryptionError, match=r"scrypt's cost is 2\^30"):
+        age.decrypt(data, WORDS)
+
+
+def test_a_backup_of_the_earlier_kind_is_restored(
+    tmp_path: Path, password: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a passphrase that today is too short."""
+    before, out = content(), tmp_path / "keys.vault"
+    password.write_text("correct horse\n")
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        for name in before:
+            tar.add(paths.KEYS / name, name)
+    vault = Path(sys.executable).with_name("ansible-vault")
+    argv = [str(vault), "encrypt", "--vault-password-file", str(password), "--output", str(out), "-"]
+    subprocess.run(argv, input=archive.getvalue(), env=ansible.environment(), capture_output=True, check=True)
+    shutil.rmtree(paths.KEYS)
+    assert key_backup.restore(out, password) == len(before)
+    assert content() == before
+    assert (
+        "keys.vault: has the earlier, weaker encryption; `make backup-keys` makes a new one" in capsys.readouterr().err
+    )
+    password.write_text("another\n")
+    with pytest.raises(UserError, match=r"keys\.vault: ansible-vault decrypt: .+"):
+        key_backup.restore(out, password)
+
+
+@pytest.mark.parametrize(
+    ("passphrase", "reason"),
+    [
+        ("", "has 0 characters, and needs at least 16"),
+        ("correct horse", "has 13 characters, and needs at least 16"),
+        ("aaaaaaaaaaaaaaaaaaaaaaaa", "has 1 characters that count"),
+        ("passwordpassword", "has 7 characters that count"),
+        ("123456789012345678901234", "has 1 characters that count"),
+        ("zyxwvutsrqponmlkjihgfedcba", "has 1 characters that count"),
+        ("QwertyUiopAsdfghjklZxcvbnm", "has 3 characters that count"),
+        ("robotrobotrobotrobot", "has 5 characters that count"),
+    ],
+)
+def test_a_passphrase_that_is_found_by_trying_is_rejected(
+    tmp_path: Path, password: Path, passphrase: str, reason: str
+) -> None:
+    """Seen to fail: a backup was encrypted with an empty passphrase's file, or with one letter."""
+    password.write_text(f"{passphrase}\n")
+    out = tmp_path / "keys.backup"
+    with pytest.raises(UserError, match=rf"^the passphrase {reason}.*; take five words from a list, or what `openssl"):
+        key_backup.backup(out, password)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("passphrase", [WORDS, "3Jx9QpLz7vKe2WmT", "hn4/kGZ+3qTbXd0sVw1y", "ein Pferd frißt Äpfel"])
+def test_a_good_passphrase_is_accepted(passphrase: str) -> None:
+    passphrases.check(passphrase)
 
 
 def test_a_backup_replaces_no_other_keys(fleet: Fleet, tmp_path: Path, password: Path) -> None:
@@ -236,24 +340,32 @@ def test_a_backup_replaces_no_other_keys(fleet: Fleet, tmp_path: Path, password:
     assert content() == before
 
 
-@pytest.mark.parametrize("damage", ["passphrase", "bytes", "no tar"])
-def test_a_backup_that_cannot_be_read_changes_nothing(tmp_path: Path, password: Path, damage: str) -> None:
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        ("passphrase", "the passphrase is wrong, or the file was changed"),
+        ("bytes", "the file was changed, or its end is missing"),
+        ("no age file", "is no age file that is encrypted with a passphrase"),
+        ("no tar", "no backup of keys: "),
+    ],
+)
+def test_a_backup_that_cannot_be_read_changes_nothing(tmp_path: Path, password: Path, damage: str, reason: str) -> None:
     before, out = content(), tmp_path / "keys.backup"
     key_backup.backup(out, password)
     if damage == "passphrase":
         password.write_text("another\n")
     elif damage == "bytes":
-        text = out.read_text()
-        out.write_text(text[:200] + ("0" if text[200] != "0" else "1") + text[201:])
+        data = out.read_bytes()
+        out.write_bytes(data[:-200] + bytes([data[-200] ^ 1]) + data[-199:])
     else:
-        done = key_backup._vault("encrypt", password, b"no tar")
-        out.write_bytes(done)
-    with pytest.raises(UserError, match=r"no backup of keys" if damage == "no tar" else r"ansible-vault decrypt: .+"):
+        out.write_bytes(age.encrypt(b"no tar", WORDS) if damage == "no tar" else b"no tar")
+    with pytest.raises(
+        UserError, match=rf"keys\.backup: no backup of keys: .*{reason.removeprefix('no backup of keys: ')}"
+    ):
         key_backup.restore(out, password)
     assert content() == before
 
 
-@pytest.mark.usefixtures("in_the_clear")
 @pytest.mark.parametrize(
     ("name", "changed", "said"),
     [
@@ -277,7 +389,9 @@ def test_a_backup_that_cannot_be_read_changes_nothing(tmp_path: Path, password: 
         ("known_hosts", {}, "'known_hosts' stands twice"),
     ],
 )
-def test_a_backup_brings_nothing_but_keys(tmp_path: Path, name: str, changed: dict[str, object], said: str) -> None:
+def test_a_backup_brings_nothing_but_keys(
+    tmp_path: Path, password: Path, name: str, changed: dict[str, object], said: str
+) -> None:
     """Seen to fail where tarfile unpacked: in the directory of keys, directories and links were restored."""
     before, archive = content(), io.BytesIO()
     for each, fields in (("known_hosts", {}), (name, changed)):
@@ -287,30 +401,30 @@ def test_a_backup_brings_nothing_but_keys(tmp_path: Path, name: str, changed: di
             setattr(member, field, value)
         archive.write(member.tobuf(tarfile.PAX_FORMAT) + b"x".ljust(512, b"\0"))
     out = tmp_path / "keys.backup"
-    out.write_bytes(archive.getvalue() + bytes(1024))
+    out.write_bytes(age.encrypt(archive.getvalue() + bytes(1024), WORDS))
     with pytest.raises(UserError, match=said):
-        key_backup.restore(out, None)
+        key_backup.restore(out, password)
     assert content() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["keys", "keys.backup"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["keys", "keys.backup", "password"]
 
 
-@pytest.mark.usefixtures("in_the_clear")
-def test_modes_of_a_backup_do_not_count(tmp_path: Path) -> None:
+def test_modes_of_a_backup_do_not_count(tmp_path: Path, password: Path) -> None:
     """Whatever the umask, and whatever the tar says: setuid, or readable by all."""
     archive, out = io.BytesIO(), tmp_path / "keys.backup"
     member = tarfile.TarInfo("robot9_ed25519")
     member.mode, member.uid, member.size = 0o6777, 1234, 3
     with tarfile.open(fileobj=archive, mode="w") as tar:
         tar.addfile(member, io.BytesIO(b"key"))
-    out.write_bytes(archive.getvalue())
+    out.write_bytes(age.encrypt(archive.getvalue(), WORDS))
     shutil.rmtree(paths.KEYS)
-    assert key_backup.restore(out, None) == 1
+    assert key_backup.restore(out, password) == 1
     found = (paths.KEYS / "robot9_ed25519").stat()
     assert (stat.S_IMODE(found.st_mode), found.st_uid) == (0o600, os.geteuid())
 
 
-@pytest.mark.usefixtures("in_the_clear")
-def test_the_first_python_of_debian_12_restores_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_python_of_debian_12_restores_keys(
+    tmp_path: Path, password: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Seen to fail: its tarfile knows no filters, which came with Python 3.11.4."""
 
     def extract_all(
@@ -319,39 +433,38 @@ def test_the_first_python_of_debian_12_restores_keys(tmp_path: Path, monkeypatch
         raise AssertionError("keys are not unpacked by tarfile")
 
     before, out = content(), tmp_path / "keys.backup"
-    key_backup.backup(out, None)
+    key_backup.backup(out, password)
     shutil.rmtree(paths.KEYS)
     monkeypatch.setattr(tarfile.TarFile, "extractall", extract_all)
-    key_backup.restore(out, None)
+    key_backup.restore(out, password)
     assert content() == before
 
 
-@pytest.mark.usefixtures("in_the_clear")
-def test_a_key_that_is_a_link_is_in_the_backup(tmp_path: Path) -> None:
+def test_a_key_that_is_a_link_is_in_the_backup(tmp_path: Path, password: Path) -> None:
     """Seen to fail: the link was in the backup, and a restore refused it."""
     key, elsewhere, out = paths.KEYS / "operator_ed25519", tmp_path / "elsewhere", tmp_path / "keys.backup"
     key.rename(elsewhere)
     key.symlink_to(elsewhere)
-    key_backup.backup(out, None)
+    key_backup.backup(out, password)
     shutil.rmtree(paths.KEYS)
-    key_backup.restore(out, None)
+    key_backup.restore(out, password)
     assert not key.is_symlink()
     assert key.read_bytes() == elsewhere.read_bytes()
 
 
-@pytest.mark.usefixtures("in_the_clear")
-def test_what_could_not_be_restored_is_not_backed_up(tmp_path: Path) -> None:
+def test_what_could_not_be_restored_is_not_backed_up(tmp_path: Path, password: Path) -> None:
     (paths.KEYS / "my key").write_text("x")
     with pytest.raises(UserError, match=r"keys/my key: is no name of a key.*move it away, or give it another name"):
-        key_backup.backup(tmp_path / "keys.backup", None)
+        key_backup.backup(tmp_path / "keys.backup", password)
 
 
-@pytest.mark.usefixtures("in_the_clear")
 @pytest.mark.parametrize("done", [0, 1, 5])
-def test_an_interrupted_restore_can_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: int) -> None:
+def test_an_interrupted_restore_can_be_repeated(
+    tmp_path: Path, password: Path, monkeypatch: pytest.MonkeyPatch, done: int
+) -> None:
     """Wherever it stops no file is half there."""
     before, out = content(), tmp_path / "keys.backup"
-    key_backup.backup(out, None)
+    key_backup.backup(out, password)
     shutil.rmtree(paths.KEYS)
     replaced: list[Path] = []
 
@@ -365,18 +478,22 @@ def test_an_interrupted_restore_can_be_repeated(tmp_path: Path, monkeypatch: pyt
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", replace)
         with pytest.raises(KeyboardInterrupt):
-            key_backup.restore(out, None)
+            key_backup.restore(out, password)
     assert content() == {path.name: before[path.name] for path in replaced}
-    key_backup.restore(out, None)
+    key_backup.restore(out, password)
     assert content() == before
 
 
-def test_a_backup_that_fails_leaves_the_last_good_one(tmp_path: Path) -> None:
+def test_a_backup_that_fails_leaves_the_last_good_one(tmp_path: Path, password: Path) -> None:
     out = tmp_path / "keys.backup"
     out.write_text("the last good one")
-    with pytest.raises(UserError, match=r"nowhere: no such file; it holds the passphrase"):
+    with pytest.raises(UserError, match=r"nowhere: No such file or directory; give a file that contains the p"):
         key_backup.backup(out, tmp_path / "nowhere")
     assert out.read_text() == "the last good one"
+    with pytest.raises(UserError, match=r"there is no terminal to ask for the passphrase; .*PASSWORD_FILE="):
+        key_backup.backup(out, None)
+    with pytest.raises(UserError, match=r"OUT=.*none/keys: No such file or directory; give a file in a directory"):
+        key_backup.backup(tmp_path / "none" / "keys", password)
     with pytest.raises(UserError, match=r"no such file; `make backup-keys OUT=FILE` makes one"):
         key_backup.restore(tmp_path / "none", tmp_path / "nowhere")
 
@@ -384,8 +501,8 @@ def test_a_backup_that_fails_leaves_the_last_good_one(tmp_path: Path) -> None:
 def test_the_passphrase_is_asked_on_the_terminal(tmp_path: Path, password: Path) -> None:
     """Twice, and not shown."""
     out = tmp_path / "keys.backup"
-    questions = (r"\n?New Vault password[^\n]*: ", r"\n?Confirm New Vault password[^\n]*: ")
-    said = terminal.answered(["backup-keys", str(out)], dict.fromkeys(questions, "correct horse"))
+    questions = ("Passphrase of the backup: ", "The same passphrase again: ")
+    said = terminal.answered(["backup-keys", str(out)], dict.fromkeys(questions, WORDS))
     assert "encrypted" in said
     assert "horse" not in said
     shutil.rmtree(paths.KEYS)

@@ -49,7 +49,7 @@ GIVEN = {
     "bench": ["ROBOT"],
     "station": ["PORT", "ADDRESS", "OUT", "REPLAY", "SECONDS"],
     "record": ["PORT", "SECONDS", "ADDRESS"],
-    "live": ["OUT", "SECONDS"],
+    "live": ["OUT", "SECONDS", "ORIGIN"],
     "top": ["OUT", "PORT"],
     "fetch": ["ROBOT", "TASK", "OUT"],
     "convert": ["OUT", "TOPIC"],
