@@ -209,6 +209,7 @@ def test_the_page_of_threats_has_the_declaration() -> None:
     }
 
 
+@pytest.mark.nightly  # together they take most of a minute of processor time
 @pytest.mark.parametrize("command", sorted(RUN.keys() - {"backup-keys"}))
 def test_a_command_reads_the_private_keys_that_are_declared(
     command: str, environment: dict[str, str], tmp_path: Path
@@ -218,6 +219,7 @@ def test_a_command_reads_the_private_keys_that_are_declared(
     assert run([command, *arguments], environment) == declared(command)
 
 
+@pytest.mark.nightly  # together they take most of a minute of processor time
 @pytest.mark.parametrize("command", sorted(UNTIL_INTERRUPTED))
 def test_a_command_that_serves_reads_the_private_keys_that_are_declared(
     command: str, environment: dict[str, str], tmp_path: Path
