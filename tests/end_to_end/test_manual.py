@@ -185,6 +185,11 @@ ELSEWHERE = {
     "make deploy ROBOT=3 APP=apps/hover": "runs until Ctrl-C; test_deploy.py",
     "make deploy ROBOT=3 APP=apps/hover RUN=status": "needs the robot; test_deploy.py asks a guest",
     "make deploy ROBOT=3 APP=apps/hover ON_ROBOT=1": "needs the robot; test_deploy.py compiles on a guest",
+    **dict.fromkeys(
+        ("make new-app KIND=device NAME=sonar", "build/venv/bin/python -m pytest apps/sonar"),
+        "leaves an app behind; runtime/test_examples.py makes one elsewhere and runs its test",
+    ),
+    "make deploy ROBOT=3 APP=apps/sonar": "runs until Ctrl-C and needs the sensor; test_deploy.py",
     "make verify ROBOT=3": "test_verify.py",
     "build/venv/bin/pytest tests/runtime/test_wheeled.py": "is a test by itself",
     "make latency": "test_latency.py measures the same",
