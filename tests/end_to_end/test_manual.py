@@ -74,6 +74,9 @@ ELSEWHERE = {
             "cp images/packages/pc_uefi.list ../rovers/packages/nuc7.list",
             "echo 'firmware-realtek # Ethernet at full speed' >>../rovers/packages/nuc7.list",
             "make lock ONLY=nuc7 FLEET=../rovers",
+            "cp images/packages/pc_uefi.list ../rovers/packages/",
+            "echo 'htop # shows which process needs the processor' >>../rovers/packages/pc_uefi.list",
+            "make lock ONLY=pc_uefi FLEET=../rovers",
             "make boot ROBOT=1 FLEET=../rovers",
         ),
         "needs a fleet with the board; image/test_home.py has one",
@@ -215,6 +218,10 @@ BOOT_SECONDS = 1200
 """Until the login prompt: finite, and generous to a busy host."""
 
 
+_COMMENT = re.compile(r"""('[^']*'|"[^"]*")|#.*""")
+"""Of the shell: a `#` in quotes begins none."""
+
+
 @dataclass(frozen=True)
 class Code:
     """A fenced block of a page."""
@@ -226,7 +233,7 @@ class Code:
     def commands(self) -> list[str]:
         """One a line, without comments."""
         lines = self.text.splitlines() if self.language == COMMANDS else []
-        return [command for line in lines if (command := line.partition("#")[0].strip())]
+        return [command for line in lines if (command := _COMMENT.sub(r"\1", line).strip())]
 
     @property
     def file(self) -> Path | None:
