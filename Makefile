@@ -111,7 +111,7 @@ station-time: | setup ## write the chrony files that make this computer the cloc
 
 ##@ Apps
 .PHONY: new-app import-model deploy
-new-app: | setup ## create a working example app in apps/NAME | KIND=block|ert|fmu|make NAME=hover
+new-app: | setup ## create a working example app in apps/NAME | KIND=block|device|make|ert|fmu NAME=hover
 	$(Q)$(FLOTILLA) new-app $(call need,KIND) $(call need,NAME)
 
 import-model: | setup ## import MATLAB's packNGo archive as apps/NAME | ZIP=hover.zip NAME=hover [MODEL=name] [SAMPLE_TIMES=0.01,0.05]

@@ -454,7 +454,7 @@ def _new_app(arguments: argparse.Namespace) -> None:
 
 
 def _new_app_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", help="block, ert, fmu or make")
+    parser.add_argument("kind", help="block, device, make, ert or fmu")
     parser.add_argument("name", help="of the app, and of its directory in apps/")
 
 

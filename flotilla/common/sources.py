@@ -17,6 +17,7 @@ from flotilla.common.errors import UserError
 
 LEFT_BEHIND = (
     "__pycache__", "*.py[co]",  # Python: they name the directory that they were compiled in
+    ".pytest_cache", ".mypy_cache", ".ruff_cache",  # tests and checks of Python beside an app
     "*~", ".#*", "#*#", ".*.sw[a-p]", ".*.kate-swp",  # editors
     "*.orig", "*.rej",  # patch and git
     ".git", ".DS_Store", "Thumbs.db",

@@ -74,6 +74,9 @@ ELSEWHERE = {
             "cp images/packages/pc_uefi.list ../rovers/packages/nuc7.list",
             "echo 'firmware-realtek # Ethernet at full speed' >>../rovers/packages/nuc7.list",
             "make lock ONLY=nuc7 FLEET=../rovers",
+            "cp images/packages/pc_uefi.list ../rovers/packages/",
+            "echo 'htop # shows which process needs the processor' >>../rovers/packages/pc_uefi.list",
+            "make lock ONLY=pc_uefi FLEET=../rovers",
             "make boot ROBOT=1 FLEET=../rovers",
         ),
         "needs a fleet with the board; image/test_home.py has one",
@@ -185,6 +188,11 @@ ELSEWHERE = {
     "make deploy ROBOT=3 APP=apps/hover": "runs until Ctrl-C; test_deploy.py",
     "make deploy ROBOT=3 APP=apps/hover RUN=status": "needs the robot; test_deploy.py asks a guest",
     "make deploy ROBOT=3 APP=apps/hover ON_ROBOT=1": "needs the robot; test_deploy.py compiles on a guest",
+    **dict.fromkeys(
+        ("make new-app KIND=device NAME=sonar", "build/venv/bin/python -m pytest apps/sonar"),
+        "leaves an app behind; runtime/test_examples.py makes one elsewhere and runs its test",
+    ),
+    "make deploy ROBOT=3 APP=apps/sonar": "runs until Ctrl-C and needs the sensor; test_deploy.py",
     "make verify ROBOT=3": "test_verify.py",
     "build/venv/bin/pytest tests/runtime/test_wheeled.py": "is a test by itself",
     "make latency": "test_latency.py measures the same",
@@ -210,6 +218,10 @@ BOOT_SECONDS = 1200
 """Until the login prompt: finite, and generous to a busy host."""
 
 
+_COMMENT = re.compile(r"""('[^']*'|"[^"]*")|#.*""")
+"""Of the shell: a `#` in quotes begins none."""
+
+
 @dataclass(frozen=True)
 class Code:
     """A fenced block of a page."""
@@ -221,7 +233,7 @@ class Code:
     def commands(self) -> list[str]:
         """One a line, without comments."""
         lines = self.text.splitlines() if self.language == COMMANDS else []
-        return [command for line in lines if (command := line.partition("#")[0].strip())]
+        return [command for line in lines if (command := _COMMENT.sub(r"\1", line).strip())]
 
     @property
     def file(self) -> Path | None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -38,8 +40,8 @@ def run(flotilla_run: Path, task: Path, blocks: Path, steps: int, signal: str) -
 
 def test_there_is_one_of_each_kind_and_the_readme_names_all() -> None:
     """Seen to fail with own-loop/ removed, and with its line in the README."""
-    kinds = {app.load(EXAMPLES / name).description.kind: name for name in scaffold.OF_KIND.values()}
-    assert kinds == {kind: scaffold.OF_KIND[kind] for kind in app.KINDS}
+    kinds = {kind: app.load(EXAMPLES / name).description.kind for kind, name in scaffold.OF_KIND.items()}
+    assert kinds == {kind: kind for kind in app.KINDS} | {"device": "block"}
     tracked = {path.name for path in EXAMPLES.iterdir()} - {"README.md"}
     text = (EXAMPLES / "README.md").read_text()
     assert {name for name in tracked if f"| `{name}" not in text} == set()
@@ -59,6 +61,24 @@ def test_the_block_is_a_saw(flotilla_run: Path, tmp_path: Path) -> None:
     values = run(flotilla_run, EXAMPLES / "saw-tooth" / "task.yml", tmp_path, 400, "scaled.out")
     assert max(values) < 2
     assert sum(after < before for before, after in itertools.pairwise(values)) == 2
+
+
+def test_a_new_driver_passes_its_own_test(flotilla_run: Path, tmp_path: Path) -> None:
+    """As docs/how-to/drivers.md runs it, under another name. Seen to fail with a parser that reads frames of three
+    digits, of five, or without their R; with a step that takes a limit as a range; and with a flag that stays 1."""
+    scaffold.create("device", "my-sonar", tmp_path)
+    argv = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path / "my-sonar")]
+    done = subprocess.run(argv, cwd=paths.PROJECT, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "5 passed" in done.stdout
+
+
+def test_the_page_about_drivers_quotes_the_driver() -> None:
+    """Seen to fail with an R in lower case in the page."""
+    quoted = re.findall(r"^```c\n(.*?)^```$", (paths.PROJECT / "docs/how-to/drivers.md").read_text(), re.M | re.S)
+    source = (EXAMPLES / "range-finder" / "range_finder.c").read_text()
+    assert quoted
+    assert [text for text in quoted if text not in source] == []
 
 
 def test_the_program_compiles_by_its_makefile(tmp_path: Path) -> None:

@@ -83,30 +83,42 @@ def test_a_deployed_app_says_what_the_inventory_has_to_do_with_it() -> None:
     assert "make provision ROBOT=3 brings the inventory's back" in deploy._hint(given, "hover", keep=False)
 
 
-@pytest.mark.parametrize("kind", app.KINDS)
+@pytest.mark.parametrize("kind", scaffold.OF_KIND)
 def test_a_new_app_is_one(tmp_path: Path, kind: str) -> None:
     scaffold.create(kind, "my-app", tmp_path)
     made = app.load(tmp_path / "my-app")
-    assert (made.name, made.description.kind) == ("my-app", kind)
+    assert (made.name, made.description.kind) == ("my-app", "block" if kind == "device" else kind)
     assert not list(tmp_path.glob(".*")), "something is left beside it"
     with pytest.raises(UserError, match="my-app is there already"):
         scaffold.create(kind, "my-app", tmp_path)
 
 
 def test_a_new_app_of_no_kind(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"KIND=blok: is no kind of app; one of block, make, ert, fmu"):
+    with pytest.raises(UserError, match=r"KIND=blok: is no kind of app; one of block, device, make, ert, fmu"):
         scaffold.create("blok", "hover", tmp_path)
+
+
+def test_a_new_app_has_no_caches_of_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen to fail: bytecode of the example's test was read as text, and pytest's cache was copied."""
+    shutil.copytree(scaffold.EXAMPLES / "saw-tooth", tmp_path / "saw-tooth")
+    for name in ("__pycache__/test.pyc", ".pytest_cache/README.md", ".ruff_cache/0.1/1", ".mypy_cache/a.json"):
+        file = tmp_path / "saw-tooth" / name
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"\xa7\r\r\n")
+    monkeypatch.setattr(scaffold, "EXAMPLES", tmp_path)
+    scaffold.create("block", "my-app", tmp_path / "apps")
+    assert {path.name for path in (tmp_path / "apps" / "my-app").rglob("*")} == {"app.yml", "my_app.c", "task.yml"}
 
 
 def test_the_new_apps_compile_without_a_warning(tmp_path: Path) -> None:
     """With this computer's compiler; tests/provisioning/test_deploy.py takes the locked one."""
-    for kind in app.KINDS:
+    for kind in scaffold.OF_KIND:
         scaffold.create(kind, f"my-{kind}", tmp_path)
     include = paths.PROJECT / "runtime" / "include"
     unit = [f"-I{paths.PROJECT / 'flotilla/apps/fmi'}", str(tmp_path / "my-fmu" / "unit" / "sources" / "my_fmu.c")]
     warnings = ["-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-fsyntax-only"]
-    block = ["cc", "-std=c11", *warnings, f"-I{include}", str(tmp_path / "my-block" / "my_block.c")]
-    subprocess.run(block, check=True)
+    blocks = [str(tmp_path / "my-block" / "my_block.c"), str(tmp_path / "my-device" / "my_device.c")]
+    subprocess.run(["cc", "-std=c11", *warnings, f"-I{include}", *blocks], check=True)
     subprocess.run(["cc", "-std=gnu11", *warnings, str(tmp_path / "my-make" / "main.c")], check=True)
     subprocess.run(["cc", "-std=gnu17", "-Wall", "-Werror", "-fsyntax-only", *unit], check=True)
 

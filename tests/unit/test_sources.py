@@ -25,7 +25,7 @@ BOARD = FLEET.boards["smartcoret3"].model_copy(update={"kernel": "lean"})
 LOCKS = board_lock(BOARD).without("kernel"), read_lock("tools")
 LEFT_BEHIND = (
     "__pycache__/a.cpython-311.pyc", "a.pyc", "a.conf~", ".#a.j2", "#a.conf#", ".a.conf.swp", "a.c.orig", "a.c.rej",
-    ".DS_Store", "__pycache__/a.c", ".git/a.conf",
+    ".DS_Store", "__pycache__/a.c", ".git/a.conf", ".pytest_cache/a.c", ".mypy_cache/a.conf", ".ruff_cache/a.list",
 )  # fmt: skip
 """In no image, and not counted."""
 UNTRACKED = ("a.conf", "a.c", "a.list", "a.config", "a.patch", "a.j2", ".a", "a b.conf", "new/a.conf")
