@@ -10,7 +10,7 @@ import socket
 import subprocess
 import uuid
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,8 +71,9 @@ class Target:
             for name, content in self.before.items():
                 (self.directory / "keys" / name).write_bytes(content)
         for process in self._survivors():
-            found.append(f"process {process} is left")
-            os.kill(process, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it was ending
+                os.kill(process, signal.SIGKILL)
+                found.append(f"process {process} is left")
         return found
 
     def _files(self) -> dict[str, bytes]:

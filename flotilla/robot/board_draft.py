@@ -46,6 +46,7 @@ done
 for dog in /sys/class/watchdog/watchdog*; do
     [ ! -e "$dog" ] || say watchdog "$(cat "$dog/identity" 2>/dev/null) / $(drivers "$dog/device")"
 done
+say loaded "$(while read -r name rest; do printf '%s ' "$name"; done </proc/modules)"
 while read -r number kind rest; do
     case $kind in uart:unknown) ;; uart:*) say uart "${number%:} $kind $rest" ;; esac
 done </proc/tty/driver/serial
@@ -123,7 +124,7 @@ def render(found: Mapping[str, Sequence[str]], name: str) -> str:
         "ports": {port: {"tty": tty} for port, tty in ports.items()},
         "network_interface": "eth0",
         "disk_modules": disks,
-        "modules": _watchdog_modules(found),
+        "modules": _isa_watchdogs(found),
         "qemu": _qemu(architecture, firmware, ports, int(found["memory_kib"][0])),
         "acceptance": {
             "memory_mib": int(found["memory_kib"][0]) * 97 // 100 // 1024,
@@ -145,7 +146,10 @@ def render(found: Mapping[str, Sequence[str]], name: str) -> str:
         *(f"Disk {each}" for each in found.get("disk", [])),
         *(f"Ethernet {each}" for each in found.get("ethernet", [])),
         *(f"Radio {each}" for each in found.get("radio", [])),
-        *(f"Watchdog {each}" for each in found.get("watchdog", ["none: a hang is not noticed"])),
+        *(
+            f"Watchdog {each}"
+            for each in found.get("watchdog", _isa_watchdogs(found) or ["none: a hang is not noticed"])
+        ),
     ]
     head = "".join(f"# {note}\n" for note in notes)
     return f"---\n{head}\nboard:\n" + "".join(
@@ -196,10 +200,9 @@ def _kernel_arguments(ports: Mapping[str, str]) -> list[str]:
     return [f"8250.nr_uarts={highest + 1}"] if highest > 3 else []
 
 
-def _watchdog_modules(found: Mapping[str, Sequence[str]]) -> list[str]:
-    """Watchdogs that the kernel finds by itself need no word; one of the ISA bus does, and is named by its driver."""
-    names = (line.rpartition("/")[2].split() for line in found.get("watchdog", []))
-    return [modules[0] for modules in names if modules and modules[0] in _ISA_WATCHDOGS]
+def _isa_watchdogs(found: Mapping[str, Sequence[str]]) -> list[str]:
+    """Loaded drivers of watchdogs that no bus announces, so that they need a line. They are in no class of sysfs."""
+    return sorted(_ISA_WATCHDOGS & {*found["loaded"][0].split()})
 
 
 _ISA_WATCHDOGS = {

@@ -11,8 +11,10 @@ import base64
 import copy
 import json
 import os
+import re
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +22,12 @@ from typing import Any
 
 import pytest
 
+from flotilla.__main__ import program
 from flotilla.common import ansible, paths
-from flotilla.fleet import inventory
+from flotilla.fleet import identity, inventory
 from lab.containers import scale
+from tests.figures import PROPERTY
+from tests.station import on_loopback
 
 SECONDS = 600
 GOOD, RECORDING = "a recording", "heading/log-000001.rec"
@@ -31,7 +36,7 @@ PROXY = "-o ProxyCommand='touch {planted}'"
 SSH = """#!{python}
 import json, re, sys
 words = " ".join(sys.argv[1:])
-robot = re.search("HostKeyAlias=([a-z0-9]+)", words)[1]
+robot = (re.search("HostKeyAlias=([a-z0-9]+)", words) or ["", "robot3"])[1]  # of `deploy`'s shared connection
 with open("{log}", "a") as log:
     log.write(json.dumps(sys.argv[1:]) + "\\n")
 for marker in re.findall("BECOME-SUCCESS-[a-z]+", words):
@@ -153,7 +158,7 @@ class Played:
     """What ssh was started with."""
 
 
-Play = Callable[[str], Played]
+Play = Callable[..., Played]
 
 
 @pytest.fixture(params=["orders", pytest.param("others", marks=pytest.mark.nightly)])
@@ -187,12 +192,13 @@ def play(tmp_path: Path, answers: dict[str, str]) -> Play:
                  "for robot in fleet.robots.values(): identity.render(fleet, robot)"]  # fmt: skip
     subprocess.run(make_keys, cwd=paths.PROJECT, env=environment, check=True)
 
-    def play(playbook: str) -> Played:
+    def play(playbook: str, **variables: str) -> Played:
         log.write_text("")
         before = files(tmp_path) | files(paths.PROJECT / "ansible")
         argv = ["ansible-playbook", "-i", str(directory), "-e", f"ansible_ssh_executable={ssh}", "--forks", "16"]
+        argv += ["-e", json.dumps(variables | {"waves": ["100%"]})]
         done = subprocess.run(
-            [*argv, "-e", json.dumps({"waves": ["100%"]}), f"{playbook}.yml"], cwd=paths.PROJECT / "ansible",
+            [*argv, f"{playbook}.yml"], cwd=paths.PROJECT / "ansible",
             env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=SECONDS, check=False,
         )  # fmt: skip
         own = tuple(str(tmp_path / "build/collected" / robot) + "/" for robot in robots)
@@ -210,15 +216,30 @@ def files(directory: Path) -> set[Path]:
     return {path for path in directory.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
 
 
-@pytest.mark.parametrize("playbook", ["fleet", pytest.param("tasks", marks=pytest.mark.nightly), "collect"])
+PLAYBOOKS: dict[str, dict[str, str]] = {
+    "fleet": {}, "collect": {}, "tasks": {}, "reboot": {}, "replace": {"replaced": "robot1"}, "update": {"go": "back"},
+}  # fmt: skip
+"""With the variables that each needs."""
+EACH_RUN = ("fleet", "collect")
+
+
+def test_each_playbook_is_played() -> None:
+    there = {file.stem for file in (paths.PROJECT / "ansible").glob("*.yml")}
+    assert there - {"files"} == PLAYBOOKS.keys(), "files.yml: lists of tasks that others include"
+
+
+@pytest.mark.parametrize(
+    "playbook", [pytest.param(name, marks=[pytest.mark.nightly] * (name not in EACH_RUN)) for name in PLAYBOOKS]
+)
 def test_nothing_that_a_robot_answers_is_executed_or_written_elsewhere(
-    play: Play, answers: dict[str, str], tmp_path: Path, playbook: str
+    play: Play, answers: dict[str, str], tmp_path: Path, playbook: str, record_property: Callable[[str, str], None]
 ) -> None:
     """Seen to fail: `keys` of the answer's facts became an option of the next ssh; a recording's path led out."""
-    played = play(playbook)
+    played = play(playbook, **PLAYBOOKS[playbook])
     if playbook == "collect" and GOOD in answers:
         assert [path.read_bytes() for path in played.own if path.match(f"*/{RECORDING}")] == [b"recorded"]
-    assert len(played.asked) >= len(inventory.load_fleet(tmp_path / "inventory").robots)
+    asked = {word for argv in played.asked for word in argv if word.startswith("HostKeyAlias=")}
+    assert len(asked) >= len(answers) - len(PLAYBOOKS[playbook])  # that is replaced, or goes back, comes first
     assert not (tmp_path / "planted").exists()
     assert played.outside == set()
     assert "Traceback" not in played.said, played.said[played.said.index("Traceback") - 500 :][:3000]
@@ -226,3 +247,101 @@ def test_nothing_that_a_robot_answers_is_executed_or_written_elsewhere(
     for argv in played.asked:
         assert f'UserKnownHostsFile="{tmp_path}/keys/known_hosts"' in argv
         assert not any(word.startswith("ProxyCommand") for word in argv)
+    record_property(PROPERTY, f"rooted robots, {playbook}.yml: {len(answers)} answers, nothing executed or written")
+
+
+COMMANDS = {
+    "deploy": ["3", "examples/saw-tooth", "--run", "status"],
+    "fetch": ["3", "control"],
+    "hwcheck": ["3", "--seconds", "1"],
+    "param": ["3", "control"],
+    "releases": ["3"],
+    "scope": ["3", "control", "gyro.rate"],
+    "station-time": [],
+}
+"""Those that read a robot's answer and end. `ssh` hands the terminal to the robot; tests/unit/test_services.py has the
+answers to `station` and `top`."""
+
+
+@pytest.mark.nightly  # a process for each answer
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_command_executes_or_writes_what_a_robot_answers(
+    tmp_path: Path, command: str, record_property: Callable[[str, str], None]
+) -> None:
+    planted = tmp_path / "planted"
+    given = {**orders(planted), **failures(planted), **states()}
+    answers = [*map(json.dumps, given.values()), *texts().values()]
+    (tmp_path / "bin").mkdir()
+    ssh = tmp_path / "bin/ssh"
+    ssh.write_text(SSH.format(python=sys.executable, log=tmp_path / "asked", answers=tmp_path / "answers"))
+    ssh.chmod(0o755)
+    before = files(paths.PROJECT / "ansible")
+    done = subprocess.run(
+        [sys.executable, "-m", __name__, command, *COMMANDS[command]],
+        cwd=paths.PROJECT, input=json.dumps({"place": str(tmp_path), "answers": answers}), capture_output=True,
+        text=True, timeout=SECONDS, check=False, env=os.environ | {
+            "PATH": f"{tmp_path / 'bin'}:{Path(sys.executable).parent}:/usr/bin:/bin",
+            "INVENTORY": str(on_loopback(tmp_path / "inventory")), "BUILD": str(tmp_path / "build"),
+            "KEYS": str(tmp_path / "keys"),
+        },
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for answer, status in zip(answers, json.loads(done.stdout), strict=True):
+        said = status.pop("said")
+        assert status.pop("status") == 0 or re.search(r"robot\d", said), f"{answer[:200]}: {said}"
+        assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]|Traceback|usage:", said), f"{answer[:200]}: {said!r}"
+        assert status == {"new": []}, answer[:200]
+    assert not planted.exists()
+    assert files(paths.PROJECT / "ansible") == before
+    assert (tmp_path / "asked").exists()
+    record_property(PROPERTY, f"rooted robot, flotilla {command}: {len(answers)} answers, nothing executed or written")
+
+
+# The rest runs in a process of its own, which has imported what each command needs.
+
+
+def _ended(command: list[str], place: Path) -> dict[str, Any]:
+    """The command's status and output, and the files that it made elsewhere than in the directory of outputs."""
+    before = files(place)
+    with (place / "said").open("w+b") as said:
+        child = os.fork()
+        if child == 0:
+            os.dup2(said.fileno(), 1)
+            os.dup2(said.fileno(), 2)
+            sys.argv = ["flotilla", *command]
+            status = 1
+            try:
+                status = program()
+            except SystemExit as end:
+                status = end.code if isinstance(end.code, int) else 1
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                os._exit(status)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        said.seek(0)
+        text = said.read().decode(errors="replace")
+    new = [str(path) for path in files(place) - before if not path.is_relative_to(place / "build")]
+    return {
+        "status": status,
+        "said": text,
+        "new": [path for path in new if path not in {f"{place}/asked", f"{place}/said"}],
+    }
+
+
+def main(command: list[str]) -> None:
+    given = json.load(sys.stdin)
+    place = Path(given["place"])
+    fleet = inventory.load_fleet()
+    for robot in fleet.robots.values():
+        identity.render(fleet, robot)
+    found = []
+    for answer in given["answers"]:
+        (place / "answers").write_text(json.dumps({robot.name: answer for robot in fleet.robots.values()}))
+        found.append(_ended(command, place))
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

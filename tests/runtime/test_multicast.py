@@ -247,15 +247,16 @@ def test_who_has_not_the_key_changes_nothing(quiet: Cell) -> None:
 def test_an_answer_is_the_robots_that_has_the_key(quiet: Cell) -> None:
     """The station accepts no answer of another computer, in the name of a robot that is silent."""
     sender = multicast.Sender(quiet.content, IPv4Address("127.0.0.1"), [IPv4Address(ROBOTS[0])], KEY)
-    sender._ask()
-    nothing = multicast._HEADER.pack(multicast._ANSWERED, sender._question) + multicast._ANSWER.pack(1, 0)
-    for key, address in ((bytes(32), ROBOTS[0]), (KEY, ROBOTS[1])):
-        tag = multicast.Transfer(sender._transfer.number, key)._tag(nothing + IPv4Address(address).packed)
+    with sender._selector, sender._socket:
+        sender._ask()
+        nothing = multicast._HEADER.pack(multicast._ANSWERED, sender._question) + multicast._ANSWER.pack(1, 0)
+        for key, address in ((bytes(32), ROBOTS[0]), (KEY, ROBOTS[1])):
+            tag = multicast.Transfer(sender._transfer.number, key)._tag(nothing + IPv4Address(address).packed)
+            sender._take(ROBOTS[0], tag + nothing)
+            assert sender._robots[ROBOTS[0]].needs
+        tag = sender._transfer._tag(nothing + IPv4Address(ROBOTS[0]).packed)
         sender._take(ROBOTS[0], tag + nothing)
-        assert sender._robots[ROBOTS[0]].needs
-    tag = sender._transfer._tag(nothing + IPv4Address(ROBOTS[0]).packed)
-    sender._take(ROBOTS[0], tag + nothing)
-    assert not sender._robots[ROBOTS[0]].needs
+        assert not sender._robots[ROBOTS[0]].needs
 
 
 def test_who_never_answers_holds_nobody(quiet: Cell) -> None:

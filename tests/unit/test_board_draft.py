@@ -31,6 +31,7 @@ disk\tsda sd_mod uas xhci_pci
 ethernet\teno1 e1000e
 radio\twlp58s0 iwlwifi
 watchdog\tiTCO_wdt / iTCO_wdt i2c_i801
+loaded\tiTCO_wdt nvme e1000e
 uart\t0 uart:16550A port:000003F8 irq:4 tx:0 rx:0
 end\t
 """
@@ -45,7 +46,7 @@ clock\tpit
 disk\tsda sd_mod ata_generic
 disk\tsr0 sr_mod ata_generic
 ethernet\teth0 e100
-watchdog\tIB700 WDT / ib700wdt
+loaded\tib700wdt ata_generic e100
 uart\t0 uart:16550A port:000003F8 irq:4
 uart\t1 uart:16550A port:000002F8 irq:3
 uart\t4 uart:ST16654 port:00000100 irq:5
