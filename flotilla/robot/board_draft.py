@@ -86,7 +86,10 @@ def draft(way: str, name: str) -> str:
             f"{way[4:]}: {why}; it needs a login without a question (`ssh {way[4:]} true`), as root or with sudo "
             "without a password"
         )
-    text = render(found, name)
+    try:
+        text = render(found, name)
+    except (LookupError, ValueError) as error:  # whoever has that computer may answer anything
+        raise UserError(f"{way[4:]}: its answer is invalid: {shown(repr(error)[:200])}; nothing was written") from error
     file = paths.BUILD / "reports" / f"board_{name}.yml"
     file.parent.mkdir(parents=True, exist_ok=True)
     durable.write(file, text)

@@ -143,6 +143,24 @@ def test_a_computer_that_lets_nobody_in_is_named(remote: Path) -> None:
     assert not (remote / "reports").exists()
 
 
+REQUIRED = ("product", "firmware", "processors", "memory_kib", "flags", "clock", "loaded")
+INVALID = {f"without {key}": PC104.replace(f"\n{key}\t", "\nother\t") for key in REQUIRED} | {
+    "nothing": "end\t\n",
+    "a number that is none": PC104.replace("processors\t1", "processors\tmany"),
+    "half a port": PC104.replace("0 uart:16550A port:000003F8 irq:4", "0"),
+}
+
+
+@pytest.mark.parametrize("answer", INVALID.values(), ids=INVALID)
+def test_an_answer_that_is_none_is_named_and_nothing_is_written(remote: Path, answer: str) -> None:
+    """Seen to fail: each ended in a traceback."""
+    (remote / "answer").write_text(answer)
+    (remote / "ssh").write_text(f"#!/bin/sh\nexec cat {remote}/answer\n")
+    with pytest.raises(UserError, match="root@host: its answer is invalid"):
+        board_draft.draft("ssh:root@host", "pc104")
+    assert not (remote / "reports").exists()
+
+
 @pytest.mark.parametrize("way", ["root@host", "ssh:", "ssh:-oProxyCommand=true"])
 def test_another_target_is_named(way: str) -> None:
     with pytest.raises(UserError, match=r"give ssh:USER@HOST"):
