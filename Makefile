@@ -267,7 +267,7 @@ power-cuts: | setup-station setup-lab setup-runtime ## replay a power cut at eve
 	$(Q)$(FLOTILLA) power-cuts $(call option,--board,BOARD) $(call option,--mib,MIB)
 
 bench: | setup-tests ## measure build times, also of other image builders | [ROBOT=3]
-	$(Q)$(FLOTILLA) bench $(if $(value ROBOT),$(call given,ROBOT))
+	$(Q)$(PYTHON) -m evidence.bench $(if $(value ROBOT),$(call given,ROBOT))
 
 ##@ Runtime
 .PHONY: runtime check-runtime fuzz bench-runtime param scope station record live top drive positions fetch convert report
@@ -444,4 +444,4 @@ each_given = $(foreach each,$(value $1),$(call quoted,$(each)))
 option = $(if $(value $2),$1 $(call given,$2))
 need = $(if $(value $1),$(call given,$1),$(error say which: make $@ $1=…))
 need_each = $(if $(call need,$1),$(call each_given,$1))
-shell_scripts = git grep -l -E '^\#!/bin/(ba)?sh' -- flotilla images lab rootfs_overlay tests .ci
+shell_scripts = git grep -l -E '^\#!/bin/(ba)?sh' -- flotilla images rootfs_overlay tests .ci

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flotilla.common import paths
+from flotilla.lab.qemu.radio import Radio
+from flotilla.lab.qemu.timing import Deadline
 from flotilla.updates import multicast
-from lab.qemu.radio import Radio
-from lab.qemu.timing import Deadline
 
 _SYMBOL_BYTES = multicast.HEADERS + multicast.OVERHEAD + multicast.SYMBOL
 """Of a frame that has a symbol, which no other frame of a station has."""

@@ -32,12 +32,12 @@ import pytest
 from flotilla.common import paths
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet, Robot
-from images.builder.build import build, image_of
-from lab.qemu import qemu, saved
-from lab.qemu.guest import Guest
-from lab.qemu.saved import BOOT_SECONDS
-from lab.qemu.segment import Segment, station_address
-from lab.qemu.ssh import Ssh
+from flotilla.images.build import build, image_of
+from flotilla.lab.qemu import qemu, saved
+from flotilla.lab.qemu.guest import Guest
+from flotilla.lab.qemu.saved import BOOT_SECONDS
+from flotilla.lab.qemu.segment import Segment, station_address
+from flotilla.lab.qemu.ssh import Ssh
 
 pytest_plugins = ["tests.artefacts", "tests.figures", "tests.tiers", "tests.costs", "tests.suite"]
 

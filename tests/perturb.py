@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
-from images.builder import runtime
-from images.builder.lock import HOST
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST
 
 OFTEN = 1000
 """Stops of one process, below which it cannot be said that its threads were disturbed."""

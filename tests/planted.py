@@ -21,7 +21,7 @@ import pydantic
 
 from flotilla.common import paths, yaml_file
 from flotilla.common.errors import UserError
-from images.builder import verify
+from flotilla.images import verify
 
 FILE = Path(__file__).with_suffix(".yml")
 WORK = paths.BUILD / "planted"

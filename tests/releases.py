@@ -14,11 +14,13 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
+from flotilla.debian import runtime
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Releases
-from images.builder import bundle, runtime, slot
-from images.builder.build import BoardBuild
-from lab.staging.virtual import OVERRUN
+from flotilla.images import slot
+from flotilla.images.build import BoardBuild
+from flotilla.lab.staging.virtual import OVERRUN
+from flotilla.updates import bundle
 
 SEED, NEW_BYTES = 1, 2 << 20
 """What a delta cannot take from what a robot has: about as much as when a library of many programs is replaced."""

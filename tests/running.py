@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lab.qemu.ssh import Ssh
+from flotilla.lab.qemu.ssh import Ssh
 
 PATIENCE = 300
 """Seconds, for what takes well under one: the machine may be slow and busy, and a guest on it slower still."""

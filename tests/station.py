@@ -31,7 +31,7 @@ from flotilla.station import telemetry
 from flotilla.station.authentication import Signer
 from tests.running import PATIENCE
 
-FLEET = paths.PROJECT / "lab" / "scenarios" / "inventory"
+FLEET = paths.PROJECT / "flotilla/lab" / "scenarios" / "inventory"
 LOOPBACK = "127.{}.{}.".format(*divmod(256 + os.getpid() % 65024, 256))
 """The fleet's addresses begin so: tests that run beside these have other ones, with the same ports."""
 

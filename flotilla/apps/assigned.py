@@ -61,7 +61,7 @@ def built(fleet: Fleet, robots: Sequence[Robot]) -> dict[str, list[BuiltApp]]:
 def _built(name: str, board: Board) -> BuiltApp:
     # Here, because robots without apps need none of it, and provisioning asks for each robot in a process of its own.
     from flotilla.apps import app, builder, remote
-    from images.builder import runtime
+    from flotilla.debian import runtime
 
     subject = app.load(paths.APPS / name)
     apps.check_names(subject.directory)
@@ -78,9 +78,9 @@ def key_of(directory: Path, *words: str) -> str:
 
     Rather too much, all of this package and of those that it uses, than too little.
     """
-    package, project = Path(__file__).parent, paths.PROJECT
-    used = [package, project / "images/builder", project / "flotilla/fleet", project / "flotilla/common"]
-    return cache.digest(*words, directory, *behind_links(directory), *used, project / "requirements/build.lock")
+    rooms = [paths.PACKAGE / name for name in ("apps", "debian", "fleet", "common")]
+    locked = paths.PROJECT / "requirements/build.lock"
+    return cache.digest(*words, directory, *behind_links(directory), *rooms, locked)
 
 
 def behind_links(directory: Path) -> list[Path]:

@@ -13,9 +13,9 @@ import yaml
 from flotilla.apps import app, ert, fmu
 from flotilla.common import cache, paths, progress, sources
 from flotilla.common.errors import UserError
+from flotilla.debian import runtime, toolchain
 from flotilla.fleet import privileges
 from flotilla.fleet.model import Board, System
-from images.builder import runtime, toolchain
 
 _BUILT = ("*.o", "*.d")
 """What a copy of a project leaves out besides: what its own build left behind may be for another processor."""

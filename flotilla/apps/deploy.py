@@ -8,8 +8,8 @@ from pathlib import Path
 
 from flotilla.apps import app, builder, remote, remote_compiler
 from flotilla.common.errors import UserError
+from flotilla.debian import toolchain
 from flotilla.fleet.model import Board, Robot
-from images.builder import toolchain
 
 Run = Callable[[remote.Connection, str], str]
 

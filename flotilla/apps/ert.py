@@ -25,8 +25,8 @@ from pycparser import c_ast, c_parser
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.common.sources import LEFT_BEHIND
+from flotilla.debian import runtime
 from flotilla.fleet.model import System
-from images.builder import runtime
 
 TEMPLATE = Path(__file__).parent / "templates" / "ert_block.c.j2"
 GENERATED = "generated"

@@ -25,8 +25,8 @@ from flotilla.apps import app
 from flotilla.common import paths, progress
 from flotilla.common.errors import Problem, UserError
 from flotilla.common.sources import ignored, strays
+from flotilla.debian import runtime, toolchain
 from flotilla.fleet.model import System
-from images.builder import runtime, toolchain
 
 TEMPLATE = Path(__file__).parent / "templates" / "fmu_block.c.j2"
 HEADERS = Path(__file__).parent / "fmi"

@@ -18,9 +18,9 @@ from flotilla.apps import remote
 from flotilla.common import cache, paths, progress
 from flotilla.common.errors import UserError
 from flotilla.common.processes import limited
-from images.builder import pool, tools
-from images.builder.chroot import Chroot
-from images.builder.lock import Lock, read_lock
+from flotilla.debian import pool, tools
+from flotilla.debian.chroot import Chroot
+from flotilla.debian.lock import Lock, read_lock
 
 _EXCLUDED = (
     "usr/share/locale", "usr/share/i18n", "usr/share/info", "usr/lib/*/gconv", "usr/bin/*lto-dump*",
@@ -67,7 +67,7 @@ class Compiler:
             with progress.step(f"{self._name} compiled on {self._to.robot.name}"):
                 self._to.stream("compile", self._name, digest, str(need_kib), *argv, stdin=sent, stdout=made, log=log)
             # Into an empty directory, because tar follows links that are there: the other end may be anybody's by now.
-            # Whoever reads what was made follows no link that leads out of `work`: images.builder.runtime.command
+            # Whoever reads what was made follows no link that leads out of `work`: flotilla.debian.runtime.command
             # refuses these. By standard input tar unpacks nothing that is compressed.
             unpacked = Path(directory) / "made"
             unpacked.mkdir()

@@ -1,4 +1,4 @@
-"""The commands about cards, robots, apps and the station; `lab/commands.py` has those of the lab."""
+"""The commands about cards, robots, apps and the station; `flotilla/lab/commands.py` has those of the lab."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _image(arguments: argparse.Namespace) -> None:
     from flotilla.apps import assigned
     from flotilla.common.errors import UserError
     from flotilla.fleet import inventory
-    from images.builder import build
+    from flotilla.images import build
 
     if arguments.all == (arguments.robot is not None):
         raise UserError("say which: a robot's number, or --all")
@@ -35,7 +35,7 @@ def _image_arguments(parser: argparse.ArgumentParser) -> None:
 def _flash(arguments: argparse.Namespace) -> None:
     from flotilla.common.errors import UserError
     from flotilla.fleet import inventory
-    from images.builder import build, flash
+    from flotilla.images import build, flash
 
     if (arguments.device is None) == (arguments.file is None):
         raise UserError("say where to: the card's device, /dev/sdX, or --file FILE")
@@ -55,8 +55,8 @@ def _flash_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _kernel(arguments: argparse.Namespace) -> None:
+    from flotilla.debian import kernel
     from flotilla.fleet import inventory
-    from images.builder import kernel
 
     print(kernel.report([arguments.board or inventory.load_fleet().board().name]))
 
@@ -68,7 +68,7 @@ def _kernel_arguments(parser: argparse.ArgumentParser) -> None:
 def _verify(arguments: argparse.Namespace) -> None:
     from flotilla.apps import assigned
     from flotilla.fleet import inventory
-    from images.builder import verify
+    from flotilla.images import verify
 
     fleet = inventory.load_fleet()
     robot = inventory.robot(fleet, arguments.robot)
@@ -82,7 +82,7 @@ def _verify_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _verify_bundle(arguments: argparse.Namespace) -> None:
     from flotilla.fleet import inventory
-    from images.builder import published
+    from flotilla.updates import published
 
     print(published.verify(inventory.load_fleet(), arguments.bundle))
 
@@ -93,28 +93,15 @@ def _verify_bundle_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _size(arguments: argparse.Namespace) -> None:
     from flotilla.fleet import inventory
-    from images.builder import build, size
+    from flotilla.images import build, size
 
     robot = inventory.robot(inventory.load_fleet(), arguments.robot)
     print(size.report(build.image_of(robot), remedy=f"make image ROBOT={robot.number}"))
 
 
-def _bench(arguments: argparse.Namespace) -> None:
-    from flotilla.fleet import inventory
-    from images.builder import bench
-
-    fleet = inventory.load_fleet()
-    robot = next(iter(fleet.robots)) if arguments.robot is None else arguments.robot
-    print(bench.bench(fleet, inventory.robot(fleet, robot)))
-
-
-def _bench_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("robot", type=int, nargs="?", help="number in the inventory (the first)")
-
-
 def _lock(arguments: argparse.Namespace) -> None:
+    from flotilla.debian import lock
     from flotilla.fleet import inventory
-    from images.builder import lock
 
     recipes = lock.recipes(inventory.load_fleet().boards.values())
     print(lock.update_locks(lock.chosen(recipes, arguments.only)))
@@ -128,8 +115,7 @@ def _bundle(arguments: argparse.Namespace) -> None:
     from flotilla.common import paths, progress
     from flotilla.fleet import inventory
     from flotilla.robot import release
-    from flotilla.updates import delta
-    from images.builder import bundle
+    from flotilla.updates import bundle, delta
 
     fleet = inventory.load_fleet()
     board = fleet.board(arguments.board)
@@ -170,7 +156,7 @@ def _bundle_arguments(parser: argparse.ArgumentParser) -> None:
 def _cve(arguments: argparse.Namespace) -> None:
     from flotilla.common.errors import UserError
     from flotilla.fleet import inventory
-    from images.builder import cve
+    from flotilla.images import cve
 
     report = cve.check(inventory.load_fleet(), arguments.tracker, arguments.today)
     print((cve.as_json if arguments.json else cve.table)(report, arguments.today))
@@ -683,7 +669,6 @@ COMMANDS = (
             _verify_bundle_arguments),
     Command("Cards", "size", "list the largest packages and files of an image", _size, robot_argument),
     Command("Cards", "bundle", "build the update bundle of a board", _bundle, _bundle_arguments),
-    Command("Cards", "bench", "measure build times, also of other image builders", _bench, _bench_arguments),
     Command("Inputs", "init", "make a directory for a fleet of your own", _init, _init_arguments),
     Command("Inputs", "check-fleet", "validate the inventory", _check_fleet),
     Command("Inputs", "lock", "resolve package lists to exact versions and hashes", _lock, _lock_arguments),

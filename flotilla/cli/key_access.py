@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_CARDS = ("bench", "image", "provision", "verify")
+_CARDS = ("image", "provision", "verify")
 """Commands that render robots' files."""
 
 

@@ -17,7 +17,7 @@ from flotilla.common.text import shown
 GROUP = "flotilla.commands"
 """Entry points, each a tuple of `Command`, in pyproject.toml: so the lab has commands, and nothing here knows it."""
 
-OURS = ("flotilla", "images", "lab")
+OURS = ("flotilla",)
 """Packages of this checkout, which no group of requirements/ brings."""
 
 

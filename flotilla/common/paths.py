@@ -22,7 +22,9 @@ from pathlib import Path
 
 from flotilla.common.errors import UserError
 
-PROJECT = Path(__file__).resolve().parents[2]
+PACKAGE = Path(__file__).resolve().parents[1]
+"""This package's own modules and data."""
+PROJECT = PACKAGE.parent
 HOME = Path(os.environ.get("FLEET") or PROJECT).resolve()
 """The fleet's home."""
 OWN_HOME = HOME != PROJECT

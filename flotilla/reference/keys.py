@@ -13,9 +13,10 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from flotilla.apps import app
+from flotilla.debian import kernel, lock
 from flotilla.fleet.model import Board, Check, Fleet, Host, Message, Robot
+from flotilla.images import card
 from flotilla.reference.markdown import MADE, code, table
-from images.builder import card, kernel, lock
 
 _PLAIN = {
     Any: "anything", bool: "boolean", int: "integer", float: "number", str: "string", IPv4Address: "IPv4 address",

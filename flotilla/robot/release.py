@@ -1,6 +1,6 @@
 """Releases, from the station's side: what a bundle holds, which chunks a robot lacks, and what a robot should run.
 
-A bundle is made by `images/builder/bundle.py`. The robot's side is `/usr/lib/flotilla/update.py`.
+A bundle is made by `flotilla/updates/bundle.py`. The robot's side is `/usr/lib/flotilla/update.py`.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from flotilla.common import cache, durable, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.debian import pool, tools
+from flotilla.debian.lock import read_lock
 from flotilla.robot.release import Bundle, delta_of
-from images.builder import pool, tools
-from images.builder.lock import read_lock
 
 WINDOW = 1 << 18
 """Bytes of the release that a robot makes at a time; `flotilla-patch` has memory for no more."""

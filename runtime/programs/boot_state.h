@@ -6,7 +6,7 @@
  * written by the system alone Each block is one sector, in the form of GRUB's environment block (GRUB 2.06 manual, "The
  * GRUB environment block"). A state has a sequence number; the valid copy with the higher one counts. Tries count for
  * the state whose number they name. The last sectors of each slot hold its header; a slot without one is empty.
- * images/builder/card.py makes a new card, images/boot/grub.cfg.j2 is the other reader.
+ * flotilla/images/card.py makes a new card, images/boot/grub.cfg.j2 is the other reader.
  */
 #ifndef BOOT_STATE_H
 #define BOOT_STATE_H

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from flotilla.debian import tools
+from flotilla.debian.lock import read_lock
+from flotilla.debian.tools import Tools
 from flotilla.fleet.model import Fleet
-from images.builder import card, environment_block, tools
-from images.builder.lock import read_lock
-from images.builder.manifest import Manifest
-from images.builder.tools import Tools
-from lab.qemu import qemu
+from flotilla.images import card, environment_block
+from flotilla.images.manifest import Manifest
+from flotilla.lab.qemu import qemu
 from tests.boot.guests import PENTIUM, SECONDS, boot_state, has_its_identity, nothing_failed, sh, tries, until
 from tests.conftest import GuestFactory, RobotGuest
 

@@ -16,9 +16,9 @@ import pytest
 
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
-from images.builder import build, card, environment_block
-from lab.qemu import qemu
-from lab.qemu.guest import Guest
+from flotilla.images import build, card, environment_block
+from flotilla.lab.qemu import qemu
+from flotilla.lab.qemu.guest import Guest
 from tests.figures import PROPERTY
 from tests.releases import Content, successor
 

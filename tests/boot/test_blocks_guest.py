@@ -25,17 +25,17 @@ import pytest
 import yaml
 
 from flotilla.common import paths
+from flotilla.debian import pool, runtime
+from flotilla.debian.lock import read_lock
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
+from flotilla.lab.emulators import igps
+from flotilla.lab.emulators.ir104 import Ir104
+from flotilla.lab.emulators.serial_line import Device, SerialLine, UnixSocket
+from flotilla.lab.qemu import qemu
+from flotilla.lab.qemu.relay_ports import INPUTS, RelayPorts, drive_inputs
+from flotilla.lab.qemu.segment import Segment, station_address
 from flotilla.station import recording
-from images.builder import pool, runtime
-from images.builder.lock import read_lock
-from lab.emulators import igps
-from lab.emulators.ir104 import Ir104
-from lab.emulators.serial_line import Device, SerialLine, UnixSocket
-from lab.qemu import qemu
-from lab.qemu.relay_ports import INPUTS, RelayPorts, drive_inputs
-from lab.qemu.segment import Segment, station_address
 from tests.conftest import GuestFactory, RobotGuest
 from tests.running import PATIENCE, Row, Task, running_there, watching
 from tests.runtime import test_can as can

@@ -1,7 +1,7 @@
 """Robot 3's boot loader, with its boot state in every condition that could be thought of.
 
-The boot loader is the card's; the kernel only says that it was started (`lab/qemu/boot_loader.py`). That whole systems
-boot, and repair the state, is in `test_accidents.py`.
+The boot loader is the card's; the kernel only says that it was started (`flotilla/lab/qemu/boot_loader.py`). That whole
+systems boot, and repair the state, is in `test_accidents.py`.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ from pathlib import Path
 
 import pytest
 
+from flotilla.debian import tools
+from flotilla.debian.lock import read_lock
+from flotilla.debian.tools import Tools
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet
-from images.builder import card, environment_block, tools
-from images.builder.build import image_of
-from images.builder.lock import read_lock
-from images.builder.tools import Tools
-from lab.qemu import qemu
-from lab.qemu.boot_loader import BootLoader, Started, State, StubCard, header_place, initrd_place, kernel_place
-from lab.qemu.stub_computer import GAVE_UP, assemble
+from flotilla.images import card, environment_block
+from flotilla.images.build import image_of
+from flotilla.lab.qemu import qemu
+from flotilla.lab.qemu.boot_loader import BootLoader, Started, State, StubCard, header_place, initrd_place, kernel_place
+from flotilla.lab.qemu.stub_computer import GAVE_UP, assemble
 
 ROBOT = 3
 UEFI_ROBOT = 2

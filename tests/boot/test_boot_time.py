@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from flotilla.fleet.model import Fleet
-from lab.latency import boottime
+from flotilla.lab.latency import boottime
 
 FIRST_STEP_S = 4.0
 """A control task has its first period within this virtual time from the boot loader's end."""

@@ -12,11 +12,11 @@ import pytest
 from flotilla.common import paths
 from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Can, Fleet
-from images.builder import build
-from lab.qemu import qemu
-from lab.qemu.guest import Guest
-from lab.qemu.segment import station_address
-from lab.qemu.ssh import Ssh
+from flotilla.images import build
+from flotilla.lab.qemu import qemu
+from flotilla.lab.qemu.guest import Guest
+from flotilla.lab.qemu.segment import station_address
+from flotilla.lab.qemu.ssh import Ssh
 from tests.conftest import RobotGuest
 
 ROBOT = 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.qemu.saved import BOOT_SECONDS
+from flotilla.lab.qemu.saved import BOOT_SECONDS
 from tests.boot.guests import nothing_failed, sh
 from tests.conftest import GuestFactory
 

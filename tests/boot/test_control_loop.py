@@ -24,14 +24,14 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import identity, privileges
 from flotilla.fleet.model import Fleet
 from flotilla.fleet.transport import duration_s
+from flotilla.lab.acceptance import relays
+from flotilla.lab.emulators.dsp3000 import Dsp3000
+from flotilla.lab.emulators.ir104 import Ir104
+from flotilla.lab.emulators.serial_line import SerialLine, UnixSocket
+from flotilla.lab.qemu import qemu
+from flotilla.lab.qemu.relay_ports import RelayPorts
+from flotilla.lab.qemu.timing import LabError
 from flotilla.robot import parameters, scope, ssh
-from lab.acceptance import relays
-from lab.emulators.dsp3000 import Dsp3000
-from lab.emulators.ir104 import Ir104
-from lab.emulators.serial_line import SerialLine, UnixSocket
-from lab.qemu import qemu
-from lab.qemu.relay_ports import RelayPorts
-from lab.qemu.timing import LabError
 from tests.conftest import RobotGuest
 
 UNIT = "flotilla-task@heading.service"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from images.builder import card
-from lab.qemu import qemu
+from flotilla.images import card
+from flotilla.lab.qemu import qemu
 from tests.boot.guests import boot_state, nothing_failed, sh
 from tests.conftest import GuestFactory
 

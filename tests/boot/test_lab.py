@@ -21,11 +21,11 @@ from qemu.qmp import ExecuteError
 
 from flotilla.common import paths
 from flotilla.fleet.model import Network
-from lab.qemu import protocols, qemu, tiny
-from lab.qemu.guest import Guest
-from lab.qemu.process import Exited
-from lab.qemu.segment import Segment
-from lab.qemu.timing import Expired, LabError
+from flotilla.lab.qemu import protocols, qemu, tiny
+from flotilla.lab.qemu.guest import Guest
+from flotilla.lab.qemu.process import Exited
+from flotilla.lab.qemu.segment import Segment
+from flotilla.lab.qemu.timing import Expired, LabError
 
 SECONDS = 300
 """Limit for what takes one or two on an idle host."""
@@ -233,8 +233,8 @@ def test_nothing_outlives_a_killed_session(image: Path, artefacts: Path) -> None
     """A test run that is killed cannot clean up; the kernel does."""
     script = f"""
 from pathlib import Path
-from lab.qemu import tiny
-from lab.qemu.guest import Guest
+from flotilla.lab.qemu import tiny
+from flotilla.lab.qemu.guest import Guest
 guest = Guest(tiny.BOARD, Path({str(image)!r}), Path({str(artefacts / "tiny")!r}))
 guest.on()
 print(guest._emulator.pid, flush=True)

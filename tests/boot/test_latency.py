@@ -10,9 +10,9 @@ import pytest
 
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
-from lab.latency import gate, limits, machine, run, subject
-from lab.latency.controls import DELAY_US, NO_RT, Control
-from lab.latency.results import Latency, Results
+from flotilla.lab.latency import gate, limits, machine, run, subject
+from flotilla.lab.latency.controls import DELAY_US, NO_RT, Control
+from flotilla.lab.latency.results import Latency, Results
 from tests.perturb import perturbed_host
 
 KERNELS = ("lean", "debian")

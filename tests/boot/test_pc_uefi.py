@@ -11,7 +11,7 @@ import yaml
 from flotilla.common import paths
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet
-from images.builder import build
+from flotilla.images import build
 from tests.boot.guests import boot_state, nothing_failed, sh
 from tests.conftest import GuestFactory
 

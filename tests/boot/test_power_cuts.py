@@ -11,11 +11,11 @@ from typing import Any, get_args
 
 import pytest
 
+from flotilla.debian.tools import Tools
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet
-from images.builder.tools import Tools
-from lab.power_cuts import command, layout_1, scenario
-from lab.power_cuts.replay import Recording, Verdict, replay
+from flotilla.lab.power_cuts import command, layout_1, scenario
+from flotilla.lab.power_cuts.replay import Recording, Verdict, replay
 from tests.figures import PROPERTY
 
 ROBOT = 3

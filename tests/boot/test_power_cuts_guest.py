@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from flotilla.fleet.model import Fleet
-from lab.power_cuts import command, guest, scenario
-from lab.power_cuts.crash_states import CrashState, all_states
-from lab.power_cuts.replay import POWER_ONS, Recording, replay
-from lab.power_cuts.timeline import Timeline
-from lab.power_cuts.write_log import WriteLog
-from lab.qemu.saved import BOOT_SECONDS
+from flotilla.lab.power_cuts import command, guest, scenario
+from flotilla.lab.power_cuts.crash_states import CrashState, all_states
+from flotilla.lab.power_cuts.replay import POWER_ONS, Recording, replay
+from flotilla.lab.power_cuts.timeline import Timeline
+from flotilla.lab.power_cuts.write_log import WriteLog
+from flotilla.lab.qemu.saved import BOOT_SECONDS
 from tests.boot.guests import PENTIUM, SECONDS, boot_state, sh
 from tests.conftest import GuestFactory
 from tests.figures import PROPERTY

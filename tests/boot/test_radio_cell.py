@@ -1,7 +1,7 @@
 """Cards with `link: ibss`: guests whose only way to each other and to the station is an emulated 802.11 adapter.
 
 Two computers, between which the scenarios' control loop goes over the air. What happens to the cell is in order; each
-test leaves all in it. `lab/qemu/air.py` says what the air is.
+test leaves all in it. `flotilla/lab/qemu/air.py` says what the air is.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from flotilla.apps import assigned
 from flotilla.common import paths
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Robot
+from flotilla.images import build
+from flotilla.lab.containers import scale
+from flotilla.lab.qemu.guest import Guest
+from flotilla.lab.qemu.radio_segment import RadioSegment, segment_of
+from flotilla.lab.qemu.ssh import Ssh
+from flotilla.lab.qemu.timing import Deadline
+from flotilla.lab.scenarios import guests, virtual
+from flotilla.lab.scenarios.guests import GuestFleet
+from flotilla.lab.scenarios.plans import TESTED_SIDE_M
+from flotilla.lab.scenarios.virtual import Plan
 from flotilla.robot import ssh
 from flotilla.station import services
-from images.builder import build
-from lab.containers import scale
-from lab.qemu.guest import Guest
-from lab.qemu.radio_segment import RadioSegment, segment_of
-from lab.qemu.ssh import Ssh
-from lab.qemu.timing import Deadline
-from lab.scenarios import guests, virtual
-from lab.scenarios.guests import GuestFleet
-from lab.scenarios.plans import TESTED_SIDE_M
-from lab.scenarios.virtual import Plan
 from tests.figures import PROPERTY
 from tests.provisioning.test_fleet import ANSIBLE, ENVIRONMENT, Guests
 

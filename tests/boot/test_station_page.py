@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from flotilla.lab.wheeled import live
+from flotilla.lab.wheeled.live import Live
 from flotilla.robot import ssh
-from lab.wheeled import live
-from lab.wheeled.live import Live
 from tests.browser import Browser, Page
 from tests.figures import PROPERTY
 from tests.station import station

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from flotilla.fleet.model import Fleet
+from flotilla.lab.staging import virtual
+from flotilla.lab.staging.virtual import ALONE, BAD, RECEIVER, SHIPPED, UPDATER, Staged
 from flotilla.updates import multicast
-from lab.staging import virtual
-from lab.staging.virtual import ALONE, BAD, RECEIVER, SHIPPED, UPDATER, Staged
 from tests.figures import PROPERTY
 
 JITTER_NS = 100_000

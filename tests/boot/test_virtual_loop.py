@@ -11,9 +11,9 @@ import pytest
 
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
-from lab.latency import flood, virtual_loop
-from lab.latency.results import Latency
-from lab.latency.virtual_loop import CLIENTS, SECONDS, TARGET_RAD_S, WATCH_ROWS, run
+from flotilla.lab.latency import flood, virtual_loop
+from flotilla.lab.latency.results import Latency
+from flotilla.lab.latency.virtual_loop import CLIENTS, SECONDS, TARGET_RAD_S, WATCH_ROWS, run
 
 UNREADY = 80
 """Frames that give no rate: those until the driver is sure of the gyro's mode, and those that its commands garble, as

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flotilla.fleet.model import Fleet
-from lab.acceptance import checks, facts
+from flotilla.lab.acceptance import checks, facts
 from tests.boot.guests import PENTIUM, nothing_failed, sh
 from tests.conftest import GuestFactory
 

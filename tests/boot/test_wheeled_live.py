@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 
+from flotilla.lab.qemu.timing import Deadline
+from flotilla.lab.wheeled import live
+from flotilla.lab.wheeled.live import Live
 from flotilla.station import driving, receiver, station_keys, telemetry
 from flotilla.station.authentication import Signer
 from flotilla.station.driving import RATE_HZ, Driving
-from lab.qemu.timing import Deadline
-from lab.wheeled import live
-from lab.wheeled.live import Live
 
 # Each time, test_station_page.py drives the same robot, and test_wheeled_virtual.py in exact time.
 pytestmark = pytest.mark.nightly

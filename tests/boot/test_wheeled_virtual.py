@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from lab.scenarios.flight import Record
-from lab.wheeled import guest, virtual
-from lab.wheeled.by_wires import fleet
-from lab.wheeled.plant import BITRATE
-from lab.wheeled.virtual import BOOM_RAD, COURSE, OPERATORS, SILENT_S, TOWARDS_S, TROUBLES, Driven
+from flotilla.lab.scenarios.flight import Record
+from flotilla.lab.wheeled import guest, virtual
+from flotilla.lab.wheeled.by_wires import fleet
+from flotilla.lab.wheeled.plant import BITRATE
+from flotilla.lab.wheeled.virtual import BOOM_RAD, COURSE, OPERATORS, SILENT_S, TOWARDS_S, TROUBLES, Driven
 
 JITTER_NS = 60_000
 """Of either task. Seen to fail with 8 ns an instruction, where plant and robot want more than the whole processor."""

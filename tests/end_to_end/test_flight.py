@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from flotilla.fleet.model import Fleet
-from lab.scenarios import virtual
-from lab.scenarios.flight import Flight
-from lab.scenarios.plans import plans
+from flotilla.lab.scenarios import virtual
+from flotilla.lab.scenarios.flight import Flight
+from flotilla.lab.scenarios.plans import plans
 from tests.end_to_end.test_scenarios import ends_in_a_drift, hops_are_in_time, spins, square_is_flown, valves_were_open
 
 SIDE_M = 0.02

@@ -21,10 +21,10 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet
+from flotilla.images import verify
+from flotilla.lab.qemu.console import SerialConsole
+from flotilla.lab.qemu.ssh import Ssh
 from flotilla.robot import ssh
-from images.builder import verify
-from lab.qemu.console import SerialConsole
-from lab.qemu.ssh import Ssh
 
 DOCS = paths.PROJECT / "docs"
 TUTORIAL = DOCS / "tutorial.md"

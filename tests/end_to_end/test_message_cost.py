@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.scenarios import exchange, message_cost, virtual
+from flotilla.lab.scenarios import exchange, message_cost, virtual
 
 pytestmark = pytest.mark.nightly
 

@@ -12,12 +12,12 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet
+from flotilla.lab.latency import gate, report, results
+from flotilla.lab.scenarios import report as flights_report
+from flotilla.lab.scenarios import virtual
+from flotilla.lab.scenarios.flight import Flight
+from flotilla.lab.scenarios.plans import TESTED_SIDE_M, plans
 from flotilla.station import report as station_report
-from lab.latency import gate, report, results
-from lab.scenarios import report as flights_report
-from lab.scenarios import virtual
-from lab.scenarios.flight import Flight
-from lab.scenarios.plans import TESTED_SIDE_M, plans
 from tests.browser import Browser
 from tests.runtime import test_recorded_drive
 

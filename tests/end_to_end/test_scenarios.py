@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 
 from flotilla.fleet.model import Board
-from lab.scenarios import gate, report, virtual
-from lab.scenarios.flight import HOPS, Flight
-from lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, standby
+from flotilla.lab.scenarios import gate, report, virtual
+from flotilla.lab.scenarios.flight import HOPS, Flight
+from flotilla.lab.scenarios.plans import SIDE_M, TESTED_SIDE_M, disturbed, over_the_air, plans, standby
 from tests.perturb import perturbed_host
 
 # Bounds, stated before the flight, by what a trial with the published laboratory's later robots gave: RMS 19 mm,

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from lab.qemu.radio_segment import RadioSegment
-from lab.scenarios import guests, virtual
-from lab.scenarios.guests import GuestFleet
-from lab.scenarios.plans import TESTED_SIDE_M
+from flotilla.lab.qemu.radio_segment import RadioSegment
+from flotilla.lab.scenarios import guests, virtual
+from flotilla.lab.scenarios.guests import GuestFleet
+from flotilla.lab.scenarios.plans import TESTED_SIDE_M
 
 pytestmark = pytest.mark.nightly
 

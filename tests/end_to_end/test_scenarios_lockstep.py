@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from flotilla.fleet.model import Board
-from lab.scenarios import lockstep, report, virtual
-from lab.scenarios.flight import Flight
-from lab.scenarios.plans import TESTED_SIDE_M, over_the_air, plans, secured
+from flotilla.lab.scenarios import lockstep, report, virtual
+from flotilla.lab.scenarios.flight import Flight
+from flotilla.lab.scenarios.plans import TESTED_SIDE_M, over_the_air, plans, secured
 from tests.end_to_end.test_scenarios import (
     CONTROL_TASKS,
     TIMEOUT_NS,

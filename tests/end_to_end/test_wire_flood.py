@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.scenarios import flooded, virtual, wire_flood
+from flotilla.lab.scenarios import flooded, virtual, wire_flood
 
 RATE_HZ = 20_000
 _IP_DROPS = 8

@@ -15,9 +15,10 @@ from pathlib import Path
 import pytest
 
 from flotilla.common import cache, paths
+from flotilla.debian import pool
+from flotilla.debian.lock import Lock, read_lock
 from flotilla.fleet.model import Fleet
-from images.builder import build, pool
-from images.builder.lock import Lock, read_lock
+from flotilla.images import build
 from tests.figures import PROPERTY
 from tests.hosts import tree
 from tests.hosts.tree import SUPPORTED, USER, Host, Tree

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from flotilla.common import cache, namespace, paths
 from flotilla.common.errors import UserError
-from images.builder import mirror
+from flotilla.debian import mirror
 
 
 class Host(NamedTuple):

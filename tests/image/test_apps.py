@@ -9,11 +9,12 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from flotilla.apps import app, builder, remote, scaffold
+from flotilla.debian import tools
+from flotilla.debian.lock import read_lock
+from flotilla.debian.tools import Tools
 from flotilla.fleet import apps, inventory
 from flotilla.fleet.apps import BuiltApp
-from images.builder import card, data_partition, tools
-from images.builder.lock import read_lock
-from images.builder.tools import Tools
+from flotilla.images import card, data_partition
 from tests.image.test_image import Ext
 
 TELLTALE = 'const char telltale[] __attribute__((used)) = __FILE__ " " __DATE__ " " __TIME__;\n'

@@ -19,7 +19,7 @@ import pytest
 
 from flotilla.common import namespace, paths, progress
 from flotilla.fleet import inventory
-from images.builder import build as builder
+from flotilla.images import build as builder
 
 ROBOT = 3
 BOARD = inventory.load_fleet().robots[ROBOT].board
@@ -330,7 +330,7 @@ def test_a_disk_is_refused_where_it_is_too_small_alone(build: Path) -> None:
 
 def test_a_damaged_package_enters_no_image(build: Path) -> None:
     """It is removed, and where no mirror has it the build ends."""
-    from images.builder.lock import read_lock
+    from flotilla.debian.lock import read_lock
 
     package = read_lock(BOARD).packages[0]
     file = build / "pool" / f"{package.sha256}.deb"

@@ -11,10 +11,11 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from flotilla.common.errors import UserError
-from images.builder import filesystem, tools
-from images.builder.filesystem import Node
-from images.builder.lock import read_lock
-from images.builder.tools import Tools
+from flotilla.debian import tools
+from flotilla.debian.lock import read_lock
+from flotilla.debian.tools import Tools
+from flotilla.images import filesystem
+from flotilla.images.filesystem import Node
 
 SIZE = 8 << 20
 UUID = "5b0e4a3c-6f1d-4c58-9d0a-000000000009"

@@ -11,8 +11,8 @@ import pytest
 from flotilla.common import paths
 from flotilla.fleet import home
 from flotilla.fleet.model import Fleet
-from images.builder import manifest
-from images.builder.build import image_of
+from flotilla.images import manifest
+from flotilla.images.build import image_of
 
 KEPT = ("cache", "pool")
 """Of the outputs those that are named by their content."""

@@ -20,14 +20,15 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian import tools
+from flotilla.debian.lock import read_lock
+from flotilla.debian.tools import Tools
 from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Board, Fleet, Robot
-from images.builder import card, environment_block, flash, manifest, tools
-from images.builder.bmap import bmap_of, read_bmap
-from images.builder.build import image_of
-from images.builder.card import Partition
-from images.builder.lock import read_lock
-from images.builder.tools import Tools
+from flotilla.images import card, environment_block, flash, manifest
+from flotilla.images.bmap import bmap_of, read_bmap
+from flotilla.images.build import image_of
+from flotilla.images.card import Partition
 from tests.running import PATIENCE
 
 MEBIBYTE = 1 << 20

@@ -15,10 +15,11 @@ from pathlib import Path
 import pytest
 
 from flotilla.common import namespace, paths
+from flotilla.debian import tools
+from flotilla.debian.lock import read_lock
 from flotilla.fleet.model import Fleet
-from images.builder import manifest, tools, verify
-from images.builder.build import build
-from images.builder.lock import read_lock
+from flotilla.images import manifest, verify
+from flotilla.images.build import build
 
 ROBOT = 3
 LEFT_BEHIND = (

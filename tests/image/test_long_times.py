@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from flotilla.apps import app, builder, scaffold
+from flotilla.debian import runtime, toolchain, tools
+from flotilla.debian.lock import read_lock, runtime_lock
 from flotilla.fleet import inventory
 from flotilla.fleet.model import System
-from images.builder import runtime, toolchain, tools
-from images.builder.lock import read_lock, runtime_lock
 
 PC104 = System("i386", "bookworm")
 IN_2040 = datetime(2040, 1, 1, tzinfo=UTC).timestamp()

@@ -18,8 +18,8 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Fleet
-from images.builder import bundle, published
-from images.builder.build import board_build
+from flotilla.images.build import board_build
+from flotilla.updates import bundle, published
 
 
 @pytest.fixture(scope="module")

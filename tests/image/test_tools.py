@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from flotilla.common import cache
-from images.builder import pool, tools
-from images.builder.lock import read_lock
+from flotilla.debian import pool, tools
+from flotilla.debian.lock import read_lock
 
 PROGRAMS = {
     "tools": (

@@ -11,8 +11,8 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet
-from images.builder import card, compare
-from images.builder.build import build
+from flotilla.images import card, compare
+from flotilla.images.build import build
 
 ROBOT = 3
 KEPT = paths.BUILD / f"verify-robot{ROBOT}.img"

@@ -15,8 +15,8 @@ import yaml
 from flotilla.apps import app, assigned, deploy, scaffold
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet
-from images.builder import build
-from lab.qemu import virtual_fleet
+from flotilla.images import build
+from flotilla.lab.qemu import virtual_fleet
 from tests.conftest import GuestFactory
 from tests.provisioning.test_deploy import Bench, running
 from tests.provisioning.test_fleet import ANSIBLE, ENVIRONMENT, REPORTS, RUN_SECONDS, Playbook, altered

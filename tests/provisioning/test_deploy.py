@@ -17,11 +17,11 @@ from flotilla.apps import app, deploy, remote, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet
+from flotilla.lab.emulators.ir104 import Ir104
+from flotilla.lab.qemu.relay_ports import RelayPorts
+from flotilla.lab.qemu.ssh import COMMAND_SECONDS
+from flotilla.lab.qemu.timing import Deadline
 from flotilla.robot import ssh
-from lab.emulators.ir104 import Ir104
-from lab.qemu.relay_ports import RelayPorts
-from lab.qemu.ssh import COMMAND_SECONDS
-from lab.qemu.timing import Deadline
 from tests.conftest import GuestFactory, RobotGuest
 from tests.running import judged_by_outcomes
 

@@ -24,8 +24,8 @@ from flotilla.cli import main as command_line
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board, Fleet
-from lab.containers import container, scale
-from lab.qemu.ssh import Ssh
+from flotilla.lab.containers import container, scale
+from flotilla.lab.qemu.ssh import Ssh
 
 RUN_SECONDS = 1800
 RUNS = "trap 'exit 0' TERM; echo on >>$STATE_DIRECTORY/actuator; echo runs; while :; do sleep 0.05; done"

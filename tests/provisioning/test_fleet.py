@@ -23,11 +23,11 @@ import yaml
 
 from flotilla.common import paths
 from flotilla.fleet.model import Fleet, Robot
+from flotilla.lab.qemu import saved
+from flotilla.lab.qemu import virtual_fleet as virtual
+from flotilla.lab.qemu.guest import Guest
+from flotilla.lab.qemu.ssh import Ssh
 from flotilla.robot import health, ssh
-from lab.qemu import saved
-from lab.qemu import virtual_fleet as virtual
-from lab.qemu.guest import Guest
-from lab.qemu.ssh import Ssh
 
 ANSIBLE = paths.PROJECT / "ansible"
 BOOT_SECONDS = 1800

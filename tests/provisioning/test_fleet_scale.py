@@ -20,9 +20,9 @@ from flotilla.common import namespace, paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
-from lab.containers import container, scale
-from lab.qemu.ssh import Ssh
-from lab.qemu.timing import Deadline, LabError
+from flotilla.lab.containers import container, scale
+from flotilla.lab.qemu.ssh import Ssh
+from flotilla.lab.qemu.timing import Deadline, LabError
 
 RUN_SECONDS = 600
 DRIFT = {

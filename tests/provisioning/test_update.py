@@ -17,12 +17,12 @@ import pytest
 
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
+from flotilla.images import build
+from flotilla.lab.emulators.dsp3000 import Dsp3000
+from flotilla.lab.emulators.serial_line import SerialLine, UnixSocket
+from flotilla.lab.qemu import qemu
 from flotilla.robot import release
 from flotilla.updates import delta
-from images.builder import build
-from lab.emulators.dsp3000 import Dsp3000
-from lab.emulators.serial_line import SerialLine, UnixSocket
-from lab.qemu import qemu
 from tests.figures import PROPERTY
 from tests.provisioning.test_fleet import BOOT_SECONDS, Guests, Playbook, running
 from tests.releases import successor

@@ -26,15 +26,15 @@ import yaml
 from flotilla.common import paths
 from flotilla.fleet import inventory, release_keys
 from flotilla.fleet.model import Fleet, Robot
+from flotilla.images import build
+from flotilla.lab.containers import scale
+from flotilla.lab.qemu import qemu, virtual_fleet
+from flotilla.lab.qemu.guest import Guest
+from flotilla.lab.qemu.radio import Radio
+from flotilla.lab.qemu.segment import free_udp_ports
+from flotilla.lab.qemu.ssh import Ssh
 from flotilla.robot import release
-from flotilla.updates import delta, multicast
-from images.builder import build, bundle
-from lab.containers import scale
-from lab.qemu import qemu, virtual_fleet
-from lab.qemu.guest import Guest
-from lab.qemu.radio import Radio
-from lab.qemu.segment import free_udp_ports
-from lab.qemu.ssh import Ssh
+from flotilla.updates import bundle, delta, multicast
 from tests.airtime import Station
 from tests.figures import PROPERTY
 

@@ -13,7 +13,7 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from images.builder import runtime
+from flotilla.debian import runtime
 from tests.runtime.tasks import HEADERS, PLUGIN, Tasks, compile_shared
 
 

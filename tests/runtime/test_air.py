@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from lab.air import HERE, ONE_GUEST
-from lab.radio.phy import ACK_BYTES, DSSS_BIT_S, B, G
+from flotilla.lab.air import HERE, ONE_GUEST
+from flotilla.lab.radio.phy import ACK_BYTES, DSSS_BIT_S, B, G
 
 RATES_MBIT_S = (1, 2, 5.5, 11, 6, 9, 12, 18, 24, 36, 48, 54)
 """In the order in which Linux's drivers of 2.4 GHz have them."""

@@ -25,11 +25,11 @@ import yaml
 
 from flotilla.common import paths
 from flotilla.fleet import inventory
+from flotilla.images import card, environment_block
+from flotilla.lab.containers import scale
+from flotilla.lab.qemu.radio import Node, Radio
 from flotilla.robot import release
 from flotilla.updates import multicast
-from images.builder import card, environment_block
-from lab.containers import scale
-from lab.qemu.radio import Node, Radio
 from tests.airtime import Station
 from tests.runtime.test_slot import partition_table
 from tests.runtime.test_update import CHUNK, header_of, manifest_of, pack

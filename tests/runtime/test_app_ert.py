@@ -17,7 +17,7 @@ import pytest
 from flotilla.apps import ert, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from images.builder.lock import HOST
+from flotilla.debian.lock import HOST
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ import pytest
 
 from flotilla.apps import ert
 from flotilla.common.errors import UserError
-from images.builder import runtime
-from images.builder.lock import HOST
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST
 from tests.fixtures import ert_rates
 
 TASK = """\

@@ -15,9 +15,9 @@ import pytest
 
 from flotilla.apps import app, builder, ert
 from flotilla.common.errors import UserError
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST
 from flotilla.fleet.model import Fleet
-from images.builder import runtime
-from images.builder.lock import HOST
 from tests.fixtures.ert_shapes import SHAPES, Shape, write
 from tests.running import running
 

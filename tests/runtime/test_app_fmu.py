@@ -21,9 +21,9 @@ import pytest
 from flotilla.apps import app, builder, fmu, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST
 from flotilla.fleet.model import Fleet
-from images.builder import runtime
-from images.builder.lock import HOST
 from tests.running import running
 
 TWO_LAGS = paths.PROJECT / "tests/fixtures/fmu"

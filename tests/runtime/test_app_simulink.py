@@ -18,8 +18,8 @@ import pytest
 
 from flotilla.apps import ert
 from flotilla.common import paths
-from images.builder import runtime
-from images.builder.lock import HOST
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST
 
 INCLUDE = f"-I{paths.PROJECT / 'runtime' / 'include'}"
 RTWTYPES = paths.PROJECT / "examples" / "two-rates" / "generated" / "rtwtypes.h"

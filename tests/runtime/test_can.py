@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from flotilla.common import paths
-from lab.emulators.can_bus import Frame, UdpHub
-from lab.emulators.epos2 import Axis, Epos2, Epos2Server
+from flotilla.lab.emulators.can_bus import Frame, UdpHub
+from flotilla.lab.emulators.epos2 import Axis, Epos2, Epos2Server
 from tests.running import PATIENCE, Task, running
 
 pytestmark = pytest.mark.clock

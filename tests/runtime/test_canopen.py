@@ -19,8 +19,8 @@ import pytest
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 from canopen.profiles.p402 import State402
 
-from lab.emulators.can_bus import EXTENDED, REMOTE, Frame, UdpHub
-from lab.emulators.epos2 import Axis, Epos2, Epos2Server
+from flotilla.lab.emulators.can_bus import EXTENDED, REMOTE, Frame, UdpHub
+from flotilla.lab.emulators.epos2 import Axis, Epos2, Epos2Server
 from tests.running import PATIENCE
 from tests.runtime import test_can
 from tests.runtime.test_can import NODE, drive_task

@@ -15,7 +15,7 @@ import pytest
 from flotilla.common import paths
 from flotilla.fleet import dds_security, identity, keys
 from flotilla.fleet.model import Fleet
-from lab.scenarios import virtual
+from flotilla.lab.scenarios import virtual
 from tests.running import DDS_ON_LOOPBACK, Task, running
 from tests.runtime import test_dds
 

@@ -24,9 +24,9 @@ import pytest
 
 from flotilla.common import paths, signals
 from flotilla.fleet import inventory
+from flotilla.lab.wheeled import by_wires
 from flotilla.station import inputs, telemetry
 from flotilla.station.driving import COMMAND, Motion
-from lab.wheeled import by_wires
 from tests.running import PATIENCE
 from tests.station import LOOPBACK, ProvenWay, secret_in
 

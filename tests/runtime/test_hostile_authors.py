@@ -24,9 +24,9 @@ import pytest
 from flotilla.apps import app, builder, fmu, imported, remote, remote_compiler, scaffold
 from flotilla.common import paths, sandbox
 from flotilla.common.errors import UserError
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST, runtime_lock
 from flotilla.fleet.model import Board, Fleet
-from images.builder import runtime
-from images.builder.lock import HOST, runtime_lock
 from tests import hostile
 from tests.figures import PROPERTY
 from tests.hostile import SECRET

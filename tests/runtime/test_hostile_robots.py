@@ -25,7 +25,7 @@ import pytest
 from flotilla.__main__ import program
 from flotilla.common import ansible, paths
 from flotilla.fleet import identity, inventory
-from lab.containers import scale
+from flotilla.lab.containers import scale
 from tests.figures import PROPERTY
 from tests.station import on_loopback
 

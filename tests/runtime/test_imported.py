@@ -17,7 +17,7 @@ import pytest
 from flotilla.apps import app, ert, imported, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from images.builder.lock import HOST
+from flotilla.debian.lock import HOST
 from tests.fixtures import ert_rates
 from tests.fixtures.ert_shapes import SHAPES, write
 

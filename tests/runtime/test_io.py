@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.emulators.igps import Faults, Igps
+from flotilla.lab.emulators.igps import Faults, Igps
 from tests.running import PATIENCE, Task, free_port, running, watching
 
 pytestmark = pytest.mark.clock

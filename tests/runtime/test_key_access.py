@@ -29,9 +29,9 @@ from flotilla.cli.main import commands
 from flotilla.common import paths
 from flotilla.fleet import identity, inventory, keys
 from flotilla.fleet.model import Releases
-from images.builder import bundle
-from lab.acceptance import outcome
-from lab.wheeled import by_wires
+from flotilla.lab.acceptance import outcome
+from flotilla.lab.wheeled import by_wires
+from flotilla.updates import bundle
 from tests.running import PATIENCE
 from tests.station import ADDRESS, on_loopback
 

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pytest
 
-from lab import air
-from lab.radio.phy import ACK_BYTES, B
+from flotilla.lab import air
+from flotilla.lab.radio.phy import ACK_BYTES, B
 
 MS = 1_000_000
 LONG_QUANTUM_NS = 10 * MS

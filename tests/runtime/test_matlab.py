@@ -17,8 +17,8 @@ import pytest
 
 from flotilla.apps import app, ert, imported
 from flotilla.common import paths
-from images.builder import runtime
-from images.builder.lock import HOST
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST
 from tests.fixtures import ert_rates
 
 pytestmark = pytest.mark.nightly  # Octave, which nothing else needs, is 261 MB

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
+from flotilla.lab.emulators.igps import Faults, Igps
 from flotilla.station.authentication import Signer
-from lab.emulators.igps import Faults, Igps
 from tests.running import PATIENCE, Task, free_port, running, watching
 
 pytestmark = pytest.mark.clock

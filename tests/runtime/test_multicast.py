@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from flotilla.common import paths
+from flotilla.lab.qemu.radio import Radio
 from flotilla.updates import multicast
-from lab.qemu.radio import Radio
 
 STATION = "10.42.0.254"
 STRANGER = "10.42.0.99"

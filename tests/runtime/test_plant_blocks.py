@@ -16,9 +16,9 @@ import pytest
 import yaml
 
 from flotilla.common import paths
-from lab.emulators import dsp3000
-from lab.emulators.serial_line import Pty
-from lab.plants.plant import DIRECTORY, ROBOT, Plant
+from flotilla.lab.emulators import dsp3000
+from flotilla.lab.emulators.serial_line import Pty
+from flotilla.lab.plants.plant import DIRECTORY, ROBOT, Plant
 from tests.running import PATIENCE, Row
 
 PERIOD_S = 0.01

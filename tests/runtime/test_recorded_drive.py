@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
+from flotilla.lab.wheeled import by_wires
+from flotilla.lab.wheeled.by_wires import Command, Course
 from flotilla.station import convert, pictures, report
-from lab.wheeled import by_wires
-from lab.wheeled.by_wires import Command, Course
 from tests.running import PATIENCE
 from tests.runtime import test_plant_blocks
 from tests.station import decoded

@@ -26,7 +26,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from flotilla.common import paths
-from lab.qemu.radio import Radio
+from flotilla.lab.qemu.radio import Radio
 from tests.running import Task, judged_by_outcomes
 
 ROBOT, COMPUTER = "10.42.0.1", "10.42.0.254"

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from lab.emulators.dsp3000 import Dsp3000, Format
-from lab.emulators.micromag3 import MicroMag3
-from lab.emulators.oceanserver import Battery, OceanServer
-from lab.emulators.serial_line import Faults, SerialLine
-from lab.emulators.urg import Urg
+from flotilla.lab.emulators.dsp3000 import Dsp3000, Format
+from flotilla.lab.emulators.micromag3 import MicroMag3
+from flotilla.lab.emulators.oceanserver import Battery, OceanServer
+from flotilla.lab.emulators.serial_line import Faults, SerialLine
+from flotilla.lab.emulators.urg import Urg
 from tests.running import PATIENCE, Row, Task, running
 
 pytestmark = pytest.mark.clock

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from flotilla.fleet import inventory
-from images.builder import card, environment_block
+from flotilla.images import card, environment_block
 
 COPIES = [card.STATE.start + place for place in card.COPIES]
 EMPTY = environment_block.make({}, card.HEADER_BYTES)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.scenarios import by_wires
+from flotilla.lab.scenarios import by_wires
 from tests.runtime import test_plant_blocks
 
 command = test_plant_blocks.command

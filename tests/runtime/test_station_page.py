@@ -36,7 +36,7 @@ from tests.runtime.test_param import Running
 from tests.station import ADDRESS, NEIGHBOUR, decoded, on_loopback, secret_in, station
 from tests.station_page import Station, WheeledRobot, connected, until
 
-WHEELED = Path("lab/wheeled/inventory")
+WHEELED = Path("flotilla/lab/wheeled/inventory")
 SSH = """#!/bin/sh
 while [ "$1" = -o ] || [ "$1" = -F ]; do shift 2; done
 shift

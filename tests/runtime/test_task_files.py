@@ -10,8 +10,8 @@ import pytest
 from flotilla.common import paths
 from flotilla.fleet import identity, messages
 from flotilla.fleet.inventory import load_fleet
-from lab.scenarios import virtual
-from lab.wheeled.by_wires import INVENTORY as WHEELED
+from flotilla.lab.scenarios import virtual
+from flotilla.lab.wheeled.by_wires import INVENTORY as WHEELED
 from tests.runtime.tasks import HEADERS, PLUGIN, Tasks, compile_shared, task
 
 REFUSED = {

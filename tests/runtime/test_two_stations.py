@@ -15,9 +15,9 @@ import pytest
 import yaml
 
 from flotilla.fleet import identity, message_keys
+from flotilla.lab.wheeled import by_wires
 from flotilla.station.authentication import Signer
 from flotilla.station.driving import COMMAND
-from lab.wheeled import by_wires
 from tests.running import Task, free_port, running, watching
 
 FIRST, SECOND = "127.0.1.1", "127.0.1.2"

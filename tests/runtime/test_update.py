@@ -20,9 +20,9 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.images import card, environment_block
 from flotilla.robot import release
 from flotilla.updates import delta
-from images.builder import card, environment_block
 from tests.runtime.test_slot import gpt, partition_table
 
 PROGRAM = paths.OVERLAY / "usr/lib/flotilla/update.py"

@@ -18,15 +18,15 @@ import pytest
 import yaml
 
 from flotilla.common.errors import UserError
-from lab.plants import wheeled
-from lab.qemu.segment import free_udp_ports
-from lab.qemu.timing import Deadline
-from lab.wheeled import by_wires
-from lab.wheeled import plant as plant_task
-from lab.wheeled.by_wires import Command, Course, Row
-from lab.wheeled.guest import COMMAND
-from lab.wheeled.plant import Plant as PlantTask
-from lab.wheeled.plant import Room, Trouble
+from flotilla.lab.plants import wheeled
+from flotilla.lab.qemu.segment import free_udp_ports
+from flotilla.lab.qemu.timing import Deadline
+from flotilla.lab.wheeled import by_wires
+from flotilla.lab.wheeled import plant as plant_task
+from flotilla.lab.wheeled.by_wires import Command, Course, Row
+from flotilla.lab.wheeled.guest import COMMAND
+from flotilla.lab.wheeled.plant import Plant as PlantTask
+from flotilla.lab.wheeled.plant import Room, Trouble
 from tests.running import PATIENCE
 from tests.runtime import test_plant_blocks
 

@@ -14,11 +14,11 @@ import canopen
 import pytest
 import yaml
 
-from lab.emulators import urg
-from lab.emulators.can_bus import UdpHub
-from lab.emulators.epos2 import Epos2Server
-from lab.wheeled import plant
-from lab.wheeled.plant import Plant, Trouble
+from flotilla.lab.emulators import urg
+from flotilla.lab.emulators.can_bus import UdpHub
+from flotilla.lab.emulators.epos2 import Epos2Server
+from flotilla.lab.wheeled import plant
+from flotilla.lab.wheeled.plant import Plant, Trouble
 from tests.running import PATIENCE, Task, running
 from tests.runtime import test_can, test_canopen, test_plant_blocks
 from tests.runtime.test_canopen import await_that

@@ -11,8 +11,8 @@ from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from pathlib import Path
 
-from images.builder import mirror
-from images.builder.mirror import DEBIAN, SECURITY, Mirrors
+from flotilla.debian import mirror
+from flotilla.debian.mirror import DEBIAN, SECURITY, Mirrors
 
 RELEASED = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 

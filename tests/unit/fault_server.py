@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 
-from images.builder import mirror
-from images.builder.mirror import Mirrors
+from flotilla.debian import mirror
+from flotilla.debian.mirror import Mirrors
 
 PAGE = b"<!DOCTYPE html><title>Log in</title>" * 20
 

@@ -20,14 +20,14 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import keys
 from flotilla.fleet.model import Fleet, Robot
-from lab.acceptance import checks, command, facts, outcome, relays, report
-from lab.acceptance.facts import Facts
-from lab.acceptance.outcome import Acceptance
-from lab.acceptance.relays import Relay
-from lab.latency import results, target
-from lab.latency.results import Latency
-from lab.qemu.ssh import Ssh
-from lab.qemu.timing import LabError
+from flotilla.lab.acceptance import checks, command, facts, outcome, relays, report
+from flotilla.lab.acceptance.facts import Facts
+from flotilla.lab.acceptance.outcome import Acceptance
+from flotilla.lab.acceptance.relays import Relay
+from flotilla.lab.latency import results, target
+from flotilla.lab.latency.results import Latency
+from flotilla.lab.qemu.ssh import Ssh
+from flotilla.lab.qemu.timing import LabError
 
 ANSWERED = json.loads((Path(__file__).parent / "acceptance.json").read_text())
 """Parts and state that a guest of robot 3 answered, but for its vendor, its times and a sensor's temperature."""

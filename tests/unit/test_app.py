@@ -16,8 +16,8 @@ import pytest
 from flotilla.apps import app, builder, deploy, remote, scaffold
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian import runtime
 from flotilla.fleet.model import Board, Robot
-from images.builder import runtime
 
 ROBOT = Robot.model_validate({"name": "robot3", "number": 3, "address": "10.42.0.3", "board": "smartcoret3"})
 

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from evidence import bench, bench_mkosi, bench_robots
+from evidence.bench import Row, Work, table
 from flotilla.common.errors import UserError
+from flotilla.debian.lock import read_lock
 from flotilla.fleet.model import Fleet
-from images.builder import bench, bench_mkosi, bench_robots, card
-from images.builder.bench import Row, Work, table
-from images.builder.lock import read_lock
+from flotilla.images import card
 
 
 def test_table_has_ratios_to_the_first_row() -> None:
@@ -103,7 +104,7 @@ def test_mkosi_makes_a_disk_like_the_card(tmp_path: Path) -> None:
     assert {f"--package={package.name}" for package in lock.packages} < set(argv)
     assert {"--format=disk", "--bios-bootloader=grub", "--architecture=x86"} < set(argv)
     (arguments,) = (each for each in argv if each.startswith("--kernel-command-line="))
-    assert "root=PARTUUID=00000000-03 " in arguments  # as images/builder/init reads it
+    assert "root=PARTUUID=00000000-03 " in arguments  # as flotilla/images/init reads it
     (ata,) = (
         each.partition("=")[2] for each in argv if each.startswith("--kernel-modules-include=") and "pata" in each
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flotilla.common.errors import UserError
-from images.builder.bmap import BLOCK, BlockMap, Range, bmap_of, read_bmap, write_bmap
+from flotilla.images.bmap import BLOCK, BlockMap, Range, bmap_of, read_bmap, write_bmap
 
 BLOCKS = 64
 CONTENT = random.Random(3).randbytes(BLOCKS * BLOCK)

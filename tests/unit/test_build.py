@@ -12,9 +12,10 @@ import pytest
 
 from flotilla.common import cache, namespace, paths
 from flotilla.common.errors import UserError
+from flotilla.debian import pool, runtime, tools
+from flotilla.debian.lock import read_lock
 from flotilla.fleet.model import Fleet, System
-from images.builder import build, pool, rootfs, runtime, tools
-from images.builder.lock import read_lock
+from flotilla.images import build, rootfs
 
 PC104 = System("i386", "bookworm")
 
@@ -43,9 +44,9 @@ def test_a_wrong_task_ends_the_root_that_is_being_made(
         asked.append(system.architecture)
         raise UserError(f"{path.name}: wrong")
 
-    monkeypatch.setattr("images.builder.build.host.check", lambda: None)
-    monkeypatch.setattr("images.builder.build.namespace.check", lambda: None)
-    monkeypatch.setattr("images.builder.build.cache.exclusive", nullcontext)
+    monkeypatch.setattr("flotilla.images.build.host.check", lambda: None)
+    monkeypatch.setattr("flotilla.images.build.namespace.check", lambda: None)
+    monkeypatch.setattr("flotilla.images.build.cache.exclusive", nullcontext)
     monkeypatch.setattr(build, "board_build", board_build)
     monkeypatch.setattr(runtime, "check_task", check_task)
     monkeypatch.setattr(build, "_robot_images", lambda *_: pytest.fail("images are made"))

@@ -14,7 +14,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Releases
 from flotilla.robot import release
-from images.builder import bundle
+from flotilla.updates import bundle
 from tests.runtime.test_update import CHUNK, header_of, manifest_of
 from tests.runtime.test_update import pack as pack_signed
 

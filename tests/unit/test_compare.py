@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import card, compare
-from images.builder.compare import Entry
+from flotilla.images import card, compare
+from flotilla.images.compare import Entry
 
 
 def image(path: Path, **changes: int) -> Path:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flotilla.common.errors import UserError
-from images.builder import copying
+from flotilla.images import copying
 
 SHM = Path("/dev/shm")
 """A file system that neither shares blocks nor, in older kernels, takes direct input and output."""

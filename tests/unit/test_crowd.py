@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from flotilla.common.errors import UserError
-from lab.latency.results import Latency
-from lab.scenarios import command, crowd, report, virtual
+from flotilla.lab.latency.results import Latency
+from flotilla.lab.scenarios import command, crowd, report, virtual
 
 
 @pytest.mark.parametrize("size", crowd.SIZES)

@@ -24,10 +24,11 @@ from debsbom.securityscan.scanner import CveTriage
 from flotilla.cli import main as command_line
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian import pool
+from flotilla.debian.lock import Lock, Package, Suite, read_lock
+from flotilla.debian.mirror import DEBIAN, SECURITY
 from flotilla.fleet import inventory
-from images.builder import cve, pool
-from images.builder.lock import Lock, Package, Suite, read_lock
-from images.builder.mirror import DEBIAN, SECURITY
+from flotilla.images import cve
 
 TODAY = date(2026, 11, 23)
 RELEASED = datetime(2026, 11, 20, 2, 11, 10, tzinfo=UTC)

@@ -14,7 +14,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import dds_security, identity, keys
 from flotilla.fleet.model import Fleet
-from lab.scenarios import virtual
+from flotilla.lab.scenarios import virtual
 
 FILE = PurePosixPath("/etc/flotilla/dds-security.xml")
 

@@ -9,7 +9,7 @@ import lz4.block
 import pytest
 
 from flotilla.common.errors import UserError
-from images.builder import debian_kernel
+from flotilla.images import debian_kernel
 
 SETUP_SECTS = 3
 AT = 0x1000000

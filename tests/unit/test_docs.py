@@ -11,10 +11,11 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from flotilla.common import paths
+from flotilla.debian import kernel
+from flotilla.debian.lock import read_lock
 from flotilla.fleet import identity, inventory, privileges
 from flotilla.fleet.model import Fleet
-from images.builder import build, kernel, space
-from images.builder.lock import read_lock
+from flotilla.images import build, space
 
 TROUBLESHOOTING = paths.PROJECT / "docs" / "troubleshooting.md"
 OUTPUTS = ("build/", "apps/", "ansible/keys/")

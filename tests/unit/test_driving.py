@@ -15,9 +15,9 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import message_keys
 from flotilla.fleet.model import Fleet
+from flotilla.lab.wheeled import by_wires
 from flotilla.station import driving
 from flotilla.station.driving import Driving, HeldError, Motion, Operator, Refused
-from lab.wheeled import by_wires
 
 ANNA, BEN = Operator("anna-1", "Anna"), Operator("ben-1", "Ben")
 ROVER = "rover"

@@ -14,12 +14,12 @@ import pytest
 from flotilla.common import cache, durable, paths
 from flotilla.fleet import keys
 
-SOURCES = ("flotilla", "images", "lab", "ansible/plugins")
+SOURCES = ("flotilla", "ansible/plugins")
 NOT_DURABLE = {
     "flotilla/common/durable.py": "has it",
     "flotilla/apps/remote_compiler.py": "inside a result that is not complete yet",
     "flotilla/apps/fmu.py": "inside a result that is not complete yet",
-    "images/builder/rootfs.py": "inside a result that is not complete yet",
+    "flotilla/images/rootfs.py": "inside a result that is not complete yet",
     "flotilla/station/adapter.py": "in /run, which ends with the power",
     "flotilla/cli/commands.py": "a bundle that was whole before gets another name",
     "flotilla/common/cache.py": "a result that goes",

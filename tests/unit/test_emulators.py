@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 from hokuyolx import HokuyoLX
 
-from lab.emulators import dsp3000, micromag3, oceanserver, urg
-from lab.emulators.dsp3000 import Dsp3000, Mode
-from lab.emulators.micromag3 import MicroMag3
-from lab.emulators.oceanserver import Battery, OceanServer
-from lab.emulators.serial_line import Device, Faults, Pty, SerialLine, UnixSocket, at_wrong_baud
-from lab.emulators.urg import Urg
+from flotilla.lab.emulators import dsp3000, micromag3, oceanserver, urg
+from flotilla.lab.emulators.dsp3000 import Dsp3000, Mode
+from flotilla.lab.emulators.micromag3 import MicroMag3
+from flotilla.lab.emulators.oceanserver import Battery, OceanServer
+from flotilla.lab.emulators.serial_line import Device, Faults, Pty, SerialLine, UnixSocket, at_wrong_baud
+from flotilla.lab.emulators.urg import Urg
 
 TIMEOUT = 20.0
 """Far more than anything here takes, because the machine may be busy."""

@@ -9,8 +9,8 @@ from itertools import islice
 
 import pytest
 
-from lab.emulators.igps import Faults, Igps, pack
-from lab.emulators.ir104 import Ir104, Switching
+from flotilla.lab.emulators.igps import Faults, Igps, pack
+from flotilla.lab.emulators.ir104 import Ir104, Switching
 
 NOWHERE = ("127.0.0.1", 9)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lab.engines import Memory
+from evidence.engines import Memory
 
 
 def test_only_processes_of_the_tree_count(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ import pytest
 
 from flotilla.common import progress
 from flotilla.common.errors import UserError
-from images.builder.bmap import BLOCK, bmap_of, write_bmap
-from images.builder.flash import Card, Host, Target, flash
+from flotilla.images.bmap import BLOCK, bmap_of, write_bmap
+from flotilla.images.flash import Card, Host, Target, flash
 
 BLOCKS = 600
 SIZE = BLOCKS * BLOCK

@@ -23,14 +23,14 @@ import pytest
 from flotilla.apps import assigned
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian.lock import read_lock
 from flotilla.fleet import apps, identity
 from flotilla.fleet.apps import BuiltApp
 from flotilla.fleet.inventory import load_fleet
 from flotilla.fleet.model import Fleet
+from flotilla.images import card, data_partition, manifest
+from flotilla.images.filesystem import Node
 from flotilla.robot.apps import judge
-from images.builder import card, data_partition, manifest
-from images.builder.filesystem import Node
-from images.builder.lock import read_lock
 
 SERVICE = "flotilla-app@hover.service"
 

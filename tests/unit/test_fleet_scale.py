@@ -10,8 +10,8 @@ import pytest
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
-from lab.containers import container, scale
-from lab.qemu.timing import LabError
+from flotilla.lab.containers import container, scale
+from flotilla.lab.qemu.timing import LabError
 
 UP = {"outcome": "up to date", "repaired": [], "messages": []}
 

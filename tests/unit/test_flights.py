@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lab.scenarios import report
-from lab.scenarios.flight import Flight, Record
+from flotilla.lab.scenarios import report
+from flotilla.lab.scenarios.flight import Flight, Record
 
 PERIOD_NS = 10_000_000
 

@@ -121,7 +121,7 @@ def test_a_command_of_the_station_needs_it(imports: grimp.ImportGraph, command: 
 
 def test_what_runs_beside_the_command_line_needs_the_build_group_alone(imports: grimp.ImportGraph) -> None:
     """The builder starts its stages as programs, Ansible its plug-ins."""
-    starts = {module for module in imports.modules if module.split(".")[0] == "images"}
+    starts = {module for module in imports.modules if module.startswith(("flotilla.images.", "flotilla.debian."))}
     plugins = [
         *(paths.PROJECT / "ansible" / "plugins").rglob("*.py"),
         *(paths.PROJECT / "ansible/library").glob("*.py"),

@@ -13,8 +13,8 @@ import pytest
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Health
+from flotilla.lab.qemu import virtual_fleet as virtual
 from flotilla.robot import health
-from lab.qemu import virtual_fleet as virtual
 
 UNIT = "flotilla-task@heading.service"
 GYRO = Health(required_sensors=["heading.gyro"])

@@ -13,10 +13,11 @@ import yaml
 
 import flotilla.__main__ as program
 from flotilla.common import paths, sources
+from flotilla.debian import kernel, lock
+from flotilla.debian.lock import board_lock, read_lock
 from flotilla.fleet import home, identity
 from flotilla.fleet.model import Fleet
-from images.builder import kernel, lock, manifest, rootfs
-from images.builder.lock import board_lock, read_lock
+from flotilla.images import manifest, rootfs
 
 NEW = "pc_uefi"
 """The board of a new home's robot."""

@@ -21,11 +21,11 @@ from mcap.opcode import Opcode
 from flotilla.apps import imported
 from flotilla.common import paths, processes
 from flotilla.common.errors import UserError
+from flotilla.debian import runtime
+from flotilla.debian.lock import HOST
 from flotilla.fleet.model import Fleet
 from flotilla.robot import fetch, ssh
 from flotilla.station import mcap_reader
-from images.builder import runtime
-from images.builder.lock import HOST
 from tests.unit.test_station_admission import page
 
 __all__ = ["page"]

@@ -16,10 +16,10 @@ from flotilla.common.errors import UserError
 from flotilla.fleet import identity, message_keys, privileges
 from flotilla.fleet.inventory import load_fleet
 from flotilla.fleet.model import Acceptance, Device, Fleet, Ibss, IsaResources, Robot
+from flotilla.images import data_partition
+from flotilla.lab.scenarios import virtual
 from flotilla.station import telemetry
 from flotilla.updates import multicast
-from images.builder import data_partition
-from lab.scenarios import virtual
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_only_what_drives_io_ports_may(transport: str) -> None:
 
 def test_control_tasks_have_users_of_their_own_and_their_devices_alone(fleet: Fleet) -> None:
     """Seen to fail with the groups of all devices for each, and with AF_CAN for all."""
-    wheeled = load_fleet(paths.PROJECT / "lab" / "wheeled" / "inventory")
+    wheeled = load_fleet(paths.PROJECT / "flotilla/lab" / "wheeled" / "inventory")
     (robot,) = wheeled.robots.values()
     for number, (task, can) in enumerate({"drive": True, "perceive": False}.items()):
         assert robot.control_tasks[number] == task

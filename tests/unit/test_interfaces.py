@@ -11,8 +11,8 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Can, Fleet
+from flotilla.images import build
 from flotilla.robot import provision
-from images.builder import build
 
 _FLEET = inventory.load_fleet()
 NETWORK = PurePosixPath("/etc/systemd/network")

@@ -14,9 +14,9 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import ProblemsError, UserError
-from images.builder import kernel, kernel_stage
-from images.builder.kernel import Option
-from images.builder.lock import read_lock
+from flotilla.debian import kernel, kernel_stage
+from flotilla.debian.kernel import Option
+from flotilla.debian.lock import read_lock
 
 KCONFIG = """\
 config PREEMPT_RT

@@ -13,9 +13,9 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import identity, keys, operators, ssh_signatures
 from flotilla.fleet.model import Fleet, Releases
+from flotilla.lab.acceptance import outcome
 from flotilla.robot import playbook, ssh
-from images.builder import bundle
-from lab.acceptance import outcome
+from flotilla.updates import bundle
 
 pytestmark = pytest.mark.usefixtures("own_keys")
 

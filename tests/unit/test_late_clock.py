@@ -10,7 +10,7 @@ import pytest
 
 from flotilla.common import paths
 
-SCRIPTS = [paths.PROJECT / "images/builder/init", paths.OVERLAY / "usr/lib/flotilla/preinit"]
+SCRIPTS = [paths.PROJECT / "flotilla/images/init", paths.OVERLAY / "usr/lib/flotilla/preinit"]
 DECISION = re.compile(r"^late=\n.*?^esac$", re.MULTILINE | re.DOTALL)
 
 

@@ -14,9 +14,9 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian.lock import read_lock
 from flotilla.fleet import inventory
-from images.builder.lock import read_lock
-from lab.latency import (
+from flotilla.lab.latency import (
     boottime,
     command,
     compiler,
@@ -33,9 +33,9 @@ from lab.latency import (
     timerlat,
     trace,
 )
-from lab.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
-from lab.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
-from lab.qemu.ssh import Ssh
+from flotilla.lab.latency.results import Activity, Binding, Boot, Latency, Outcome, Results
+from flotilla.lab.latency.scenarios import CYCLICTEST, SCENARIOS, Scenario
+from flotilla.lab.qemu.ssh import Ssh
 
 IDLE = Scenario("idle", "idle", CYCLICTEST)
 ACTIVITY = {"services_s": 1.0, "interrupts": 1000, "context_switches": 2000, "elapsed_s": 10.0}
@@ -592,8 +592,8 @@ def test_machine_is_the_board_in_virtual_time(tmp_path: Path) -> None:
 
 
 def test_kernel_command_line_is_the_shipped_one() -> None:
-    from images.builder import card
-    from images.builder.build import BoardBuild
+    from flotilla.images import card
+    from flotilla.images.build import BoardBuild
 
     board = inventory.load_fleet().boards["smartcoret3"]
     shipped = card.kernel_arguments(board)
@@ -621,6 +621,6 @@ def test_a_port_with_a_device_is_not_measured_on_a_robot() -> None:
 
 
 def test_nothing_in_the_measurement_knows_this_computer() -> None:
-    for path in (paths.PROJECT / "lab" / "latency").rglob("*.*"):
+    for path in (paths.PROJECT / "flotilla/lab" / "latency").rglob("*.*"):
         if path.suffix in (".py", ".c", ".j2", ".json"):
             assert str(paths.PROJECT) not in path.read_text(), f"{paths.shown(path)} has an absolute path"

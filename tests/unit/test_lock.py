@@ -15,10 +15,10 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian import lock, mirror
+from flotilla.debian.lock import Lock, Package, Suite
+from flotilla.debian.mirror import DEBIAN, SECURITY
 from flotilla.fleet import inventory
-from images.builder import lock, mirror
-from images.builder.lock import Lock, Package, Suite
-from images.builder.mirror import DEBIAN, SECURITY
 from tests.unit.debian_archive import RELEASED, Archive, signing_keys, stanza
 from tests.unit.fault_server import FaultServer, certificate
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from flotilla.common.errors import UserError
-from lab.scenarios import command
-from lab.scenarios.member import since
+from flotilla.lab.scenarios import command
+from flotilla.lab.scenarios.member import since
 
 BEFORE = {"steps": 100, "overruns": 3, "skipped": 9, "timeouts": 100, "last_overrun": {"ago_s": 0.5}}
 

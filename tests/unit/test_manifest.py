@@ -21,11 +21,11 @@ from spdx_tools.spdx.parser.parse_anything import parse_file
 from spdx_tools.spdx.validation.document_validator import validate_full_spdx_document
 
 from flotilla.common.errors import UserError
+from flotilla.debian.lock import Lock, Package, Suite, format_lock, parse_lock, read_lock
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
-from images.builder import build, card, manifest
-from images.builder.filesystem import Node
-from images.builder.lock import Lock, Package, Suite, format_lock, parse_lock, read_lock
+from flotilla.images import build, card, manifest
+from flotilla.images.filesystem import Node
 
 STATUS = """Package: libone
 Status: install ok installed
@@ -165,9 +165,9 @@ def test_every_build_says_in_one_line_what_its_lock_lacks(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     locks = {"smartcoret3": replace(LOCK, name="smartcoret3"), "x86_64": read_lock("x86_64")}
-    monkeypatch.setattr("images.builder.build.host.check", lambda: None)
-    monkeypatch.setattr("images.builder.build.namespace.check", lambda: None)
-    monkeypatch.setattr("images.builder.build.cache.exclusive", nullcontext)
+    monkeypatch.setattr("flotilla.images.build.host.check", lambda: None)
+    monkeypatch.setattr("flotilla.images.build.namespace.check", lambda: None)
+    monkeypatch.setattr("flotilla.images.build.cache.exclusive", nullcontext)
     monkeypatch.setattr(build, "check_tasks", lambda *_: None)
     monkeypatch.setattr(build, "fill_pool", lambda _: None)
     monkeypatch.setattr(build, "board_build", lambda board, _: SimpleNamespace(lock=locks[board.name]))

@@ -18,9 +18,9 @@ from flotilla.common.errors import Problem, ProblemsError, UserError
 from flotilla.common.signals import CODES
 from flotilla.fleet import identity, inventory, messages, transport
 from flotilla.fleet.model import Fleet
+from flotilla.lab.scenarios import virtual
 from flotilla.station import telemetry
 from flotilla.station.schema import Schema
-from lab.scenarios import virtual
 
 FILE = paths.TASKS / paths.MESSAGES
 

@@ -54,7 +54,7 @@ def test_a_killed_builder_takes_its_stage_along(tmp_path: Path) -> None:
 
 def test_the_end_of_the_log_is_shown_when_a_stage_fails(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"no_such_stage failed \(status 1\).*\n.*No module named"):
-        namespace.run_stage("images.builder.no_such_stage", [], tmp_path / "log")
+        namespace.run_stage("flotilla.debian.no_such_stage", [], tmp_path / "log")
 
 
 REFUSED = """

@@ -14,8 +14,8 @@ from flotilla.cli import main as command_line
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Robot
+from flotilla.lab.wheeled.by_wires import INVENTORY
 from flotilla.robot import parameters, ssh
-from lab.wheeled.by_wires import INVENTORY
 
 ROBOT = Robot(name="robot3", number=3, board="smartcoret3", address=IPv4Address("10.0.0.3"))
 

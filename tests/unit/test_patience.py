@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flotilla.common import paths
 
-GUESTS = ("tests/boot", "tests/provisioning", "tests/end_to_end", "lab/qemu")
+GUESTS = ("tests/boot", "tests/provisioning", "tests/end_to_end", "flotilla/lab/qemu")
 """Folders of what waits for emulated guests and for robots in containers."""
 ENOUGH_S = 300
 """A limit only ends a run that hangs: what takes seconds on an idle computer takes a minute on a slow one."""

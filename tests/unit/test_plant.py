@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from flotilla.common.errors import UserError
-from lab.plants.plant import ROBOT, THRUSTERS, Plant, library
+from flotilla.lab.plants.plant import ROBOT, THRUSTERS, Plant, library
 
 MASS, INERTIA, FORCE, ARM = 10.5, 0.063, 0.16, 0.05
 IDEAL: dict[str, Any] = {
@@ -361,7 +361,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 def test_wrong_parameters(changes: str) -> None:
     with pytest.raises(UserError) as error:
         Plant(**WRONG[changes][0])
-    assert str(error.value).startswith("lab/plants/floating_robot.yml: ")
+    assert str(error.value).startswith("flotilla/lab/plants/floating_robot.yml: ")
     assert WRONG[changes][1] in str(error.value)
 
 

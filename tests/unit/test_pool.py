@@ -18,9 +18,9 @@ import pytest
 
 from flotilla.common import namespace, paths
 from flotilla.common.errors import UserError
-from images.builder import download, mirror, pool
-from images.builder.lock import Lock, Package, Suite
-from images.builder.mirror import DEBIAN, SECURITY, Mirrors
+from flotilla.debian import download, mirror, pool
+from flotilla.debian.lock import Lock, Package, Suite
+from flotilla.debian.mirror import DEBIAN, SECURITY, Mirrors
 from tests.unit.fault_server import PAGE, Answer, FaultServer, certificate
 
 RELEASED = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
@@ -453,8 +453,8 @@ def test_full_disk(server: FaultServer, monkeypatch: pytest.MonkeyPatch) -> None
 import sys
 from pathlib import Path
 from flotilla.common import namespace, paths
-from images.builder import pool
-from images.builder.mirror import Mirrors
+from flotilla.debian import pool
+from flotilla.debian.mirror import Mirrors
 from tests.unit.test_pool import LOCK
 from flotilla.common.errors import UserError
 paths.POOL = Path({str(paths.POOL)!r})

@@ -12,8 +12,8 @@ import pytest
 from flotilla.cli import main as command_line
 from flotilla.common import paths
 from flotilla.fleet import identity, inventory, message_keys
+from flotilla.lab.scenarios import virtual
 from flotilla.station import positions
-from lab.scenarios import virtual
 from tests.station import FLEET
 
 Said = Callable[..., str]

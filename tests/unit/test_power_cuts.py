@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from lab.power_cuts.crash_states import CrashState, Damage, all_states, filler
-from lab.power_cuts.replay import Recording, Verdict, replay
-from lab.power_cuts.starter import Content, Started
-from lab.power_cuts.timeline import UNREADABLE, Read, Timeline
-from lab.power_cuts.write_log import SECTOR, LogWriter, WriteLog, count_entries
-from lab.qemu import tiny
-from lab.qemu.timing import LabError
+from flotilla.lab.power_cuts.crash_states import CrashState, Damage, all_states, filler
+from flotilla.lab.power_cuts.replay import Recording, Verdict, replay
+from flotilla.lab.power_cuts.starter import Content, Started
+from flotilla.lab.power_cuts.timeline import UNREADABLE, Read, Timeline
+from flotilla.lab.power_cuts.write_log import SECTOR, LogWriter, WriteLog, count_entries
+from flotilla.lab.qemu import tiny
+from flotilla.lab.qemu.timing import LabError
 
 SECTORS = 24
 SLOT = 12
@@ -254,7 +254,7 @@ OLD, NEW = frozenset({"old"}), frozenset({"new"})
 def judged(monkeypatch: pytest.MonkeyPatch, directory: Path, phases: Sequence[tuple[int, frozenset[str]]],
            *writes: tuple[int, int], first: int = 0) -> Verdict:  # fmt: skip
     """The verdict on a card that begins with release `old` in slot A, after writes of one sector each: place, value."""
-    monkeypatch.setattr("lab.power_cuts.replay.Starter", Computer)
+    monkeypatch.setattr("flotilla.lab.power_cuts.replay.Starter", Computer)
     base = bytearray((FAR + 1) * SECTOR)
     for number, value in ((0, first), (8, 1), (SLOT, 3), (SLOT + 1, 5)):
         base[number * SECTOR] = value

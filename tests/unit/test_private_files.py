@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from images.builder import bmap, card
-from images.builder.flash import flash
-from lab.qemu import qemu
+from flotilla.images import bmap, card
+from flotilla.images.flash import flash
+from flotilla.lab.qemu import qemu
 
 
 @pytest.fixture(autouse=True)

@@ -20,13 +20,14 @@ import pytest
 from flotilla.common import paths, progress
 from flotilla.common.processes import DIE_WITH_PARENT
 from flotilla.common.progress import Far
-from images.builder import kernel, rootfs, runtime, verify
-from lab.containers import scale
-from lab.latency import command
-from lab.latency import run as latency
-from lab.scenarios import command as scenarios
-from lab.scenarios import fly, virtual
-from lab.scenarios.plans import plans
+from flotilla.debian import kernel, runtime
+from flotilla.images import rootfs, verify
+from flotilla.lab.containers import scale
+from flotilla.lab.latency import command
+from flotilla.lab.latency import run as latency
+from flotilla.lab.scenarios import command as scenarios
+from flotilla.lab.scenarios import fly, virtual
+from flotilla.lab.scenarios.plans import plans
 
 PATIENCE_S = 60
 """For a process to start, on however busy a computer."""

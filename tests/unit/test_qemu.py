@@ -14,8 +14,8 @@ import pytest
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Network, Robot
+from flotilla.lab.qemu import boot, qemu
 from flotilla.robot import ssh
-from lab.qemu import boot, qemu
 
 ROBOT = Robot(name="robot3", address=IPv4Address("10.42.0.3"), number=3, board="pc104")
 NETWORK = Network(subnet=IPv4Network("10.42.0.0/24"), link="ethernet", dds_domain=0, udp_ports=[])

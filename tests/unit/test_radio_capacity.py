@@ -19,8 +19,8 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
-from lab.radio import capacity, command, load, model, phy, report, traffic
-from lab.radio.load import Setting
+from flotilla.lab.radio import capacity, command, load, model, phy, report, traffic
+from flotilla.lab.radio.load import Setting
 
 M = 1_000_000
 CHAIN = "sensors → state → wrench → valves"
@@ -85,7 +85,7 @@ def test_a_standby_sends_too_and_triggers_nothing(published: Fleet) -> None:
 
 def test_where_stations_alone_listen_each_report_is_judged() -> None:
     """The wheeled robot's: ten a second of its driving, two of what it sees."""
-    described = traffic.describe(inventory.load_fleet(paths.PROJECT / "lab" / "wheeled" / "inventory"))
+    described = traffic.describe(inventory.load_fleet(paths.PROJECT / "flotilla/lab" / "wheeled" / "inventory"))
     periods_ns = {"drive-report": 100_000_000, "perceive-report": 500_000_000}
     assert {chain.name: chain.period_ns for chain in described.chains} == periods_ns
     chains = load.run(described, B, 1, 2).chains

@@ -12,9 +12,9 @@ import itertools
 
 import pytest
 
-from lab.radio import dcf, phy
-from lab.radio.dcf import Cell, Frame, Links, Timing
-from lab.radio.phy import Air
+from flotilla.lab.radio import dcf, phy
+from flotilla.lab.radio.dcf import Cell, Frame, Links, Timing
+from flotilla.lab.radio.phy import Air
 
 US = 1000
 M = 1_000_000

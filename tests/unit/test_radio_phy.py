@@ -14,8 +14,8 @@ from collections import Counter, defaultdict
 import pytest
 
 from flotilla.common.errors import UserError
-from lab.radio import phy
-from lab.radio.phy import B_SHORT, G_MIXED, Air, B, G
+from flotilla.lab.radio import phy
+from flotilla.lab.radio.phy import B_SHORT, G_MIXED, Air, B, G
 
 US = 1000
 M = 1_000_000

@@ -19,7 +19,7 @@ LISTED = """
 CHECK = """
 import os, sys
 from pathlib import Path
-from images.builder import rootfs
+from flotilla.images import rootfs
 os.umask(0o022)
 target = Path(sys.argv[1])
 for name in ("usr/bin", "etc", "tmp", "dev"):

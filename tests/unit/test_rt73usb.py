@@ -8,11 +8,11 @@ import struct
 import pytest
 
 from flotilla.fleet.model import Ibss
-from lab.emulators.rt73usb import Frame, Request, Rt73Usb
-from lab.emulators.usb_redirection import WAITING, Plug, Setup
-from lab.qemu.air import Air
-from lab.qemu.qemu import Wire
-from lab.qemu.segment import free_udp_ports
+from flotilla.lab.emulators.rt73usb import Frame, Request, Rt73Usb
+from flotilla.lab.emulators.usb_redirection import WAITING, Plug, Setup
+from flotilla.lab.qemu.air import Air
+from flotilla.lab.qemu.qemu import Wire
+from flotilla.lab.qemu.segment import free_udp_ports
 
 MAC, OTHER = bytes.fromhex("525400f20001"), bytes.fromhex("525400f20002")
 BSSID = bytes.fromhex("02caffee1042")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from flotilla.common.errors import UserError
-from lab.latency.results import Latency
-from lab.scenarios import gate
+from flotilla.lab.latency.results import Latency
+from flotilla.lab.scenarios import gate
 
 FOUND = {"udp": {"first → second": Latency.of({300: 5, 410: 1}), "four hops": Latency.of({1500: 6})}}
 

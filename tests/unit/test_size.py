@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from flotilla.common.errors import UserError
-from images.builder import size
+from flotilla.images import size
 
 LISTING = """drwxr-xr-x root/root               268 2026-11-19 02:12 squashfs-root
 lrwxrwxrwx root/root                 7 2026-11-19 02:12 squashfs-root/bin -> usr/bin

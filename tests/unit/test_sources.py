@@ -13,12 +13,13 @@ from pathlib import Path
 import pytest
 
 from flotilla.apps import app, assigned, builder
-from flotilla.common import cache, namespace, paths, sources
+from flotilla.common import cache, paths, sources
 from flotilla.common.errors import UserError
+from flotilla.debian import kernel, kernel_stage, runtime, runtime_stage
+from flotilla.debian.lock import board_lock, read_lock
 from flotilla.fleet import identity
 from flotilla.fleet.inventory import load_fleet
-from images.builder import initramfs, kernel, kernel_stage, manifest, rootfs, runtime, runtime_stage
-from images.builder.lock import board_lock, read_lock
+from flotilla.images import initramfs, manifest, rootfs
 
 FLEET = load_fleet()
 BOARD = FLEET.boards["smartcoret3"].model_copy(update={"kernel": "lean"})
@@ -242,7 +243,7 @@ def test_a_file_behind_a_link_out_of_an_app_is_counted(tmp_path: Path) -> None:
 # --- the code that makes an image ---
 
 COUNTED: dict[str, Sequence[str]] = {
-    rootfs.__file__: [*(str(Path(rootfs.__file__).with_name(name)) for name in rootfs.MADE_BY), namespace.__file__],
+    rootfs.__file__: rootfs.MADE_BY,
     runtime_stage.__file__: runtime.MADE_BY,
     kernel_stage.__file__: kernel.MADE_BY,
 }
@@ -256,12 +257,12 @@ NOT_COUNTED = {
     "flotilla.common.errors": "messages",
     "flotilla.fleet.privileges": "its users are counted",
     "flotilla.fleet.model": "what of a board is used is counted",
-    "images.builder.lock": "the lock is counted",
-    "images.builder.kernel": "its result is counted by name",
-    "images.builder.runtime": "its result is counted by name",
-    "images.builder.tools": "its result is counted by name",
-    "images.builder.mirror": "how indexes of archives are read, for locks",
-    "images.builder.download": "how packages are downloaded, whose hashes are counted",
+    "flotilla.debian.lock": "the lock is counted",
+    "flotilla.debian.kernel": "its result is counted by name",
+    "flotilla.debian.runtime": "its result is counted by name",
+    "flotilla.debian.tools": "its result is counted by name",
+    "flotilla.debian.mirror": "how indexes of archives are read, for locks",
+    "flotilla.debian.download": "how packages are downloaded, whose hashes are counted",
     "flotilla.common.durable": "when results are on the disk",
     "flotilla.common.processes": "how processes end",
     "flotilla.common.host": "what a computer must have",

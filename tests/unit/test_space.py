@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from flotilla.common import paths
-from images.builder import pool, space
-from images.builder.lock import Lock, read_lock
+from flotilla.debian import pool
+from flotilla.debian.lock import Lock, read_lock
+from flotilla.images import space
 
 MIB = 1 << 20
 

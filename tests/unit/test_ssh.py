@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from flotilla.fleet.model import Fleet
-from lab.qemu.ssh import Ssh
-from lab.qemu.timing import Expired, LabError
+from flotilla.lab.qemu.ssh import Ssh
+from flotilla.lab.qemu.timing import Expired, LabError
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.lab.wheeled import by_wires
 from flotilla.station import page_requests, watching
 from flotilla.station.access import Access, RefusedError
 from flotilla.station.page_requests import NoRequestError
@@ -20,7 +21,6 @@ from flotilla.station.replay import Replay
 from flotilla.station.telemetry import streams
 from flotilla.station.view import View
 from flotilla.station.web import PAGE
-from lab.wheeled import by_wires
 
 DRIVE = {"do": "drive", "robot": "rover", "v": 0.5, "omega": 0, "boom": 0.1, "enable": True}
 

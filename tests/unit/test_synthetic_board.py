@@ -24,14 +24,15 @@ from pydantic import BaseModel
 
 from flotilla.common import paths, yaml_file
 from flotilla.common.errors import ProblemsError, UserError
+from flotilla.debian import kernel, lock
 from flotilla.fleet import identity, inventory
 from flotilla.fleet.model import Board, Console, Fleet, Qemu, Watchdog
-from images.builder import card, kernel, lock
-from lab.latency import command as latency
-from lab.latency import controls, machine, subject, virtual_loop
-from lab.qemu import qemu
-from lab.scenarios import command as scenarios
-from lab.scenarios import virtual
+from flotilla.images import card
+from flotilla.lab.latency import command as latency
+from flotilla.lab.latency import controls, machine, subject, virtual_loop
+from flotilla.lab.qemu import qemu
+from flotilla.lab.scenarios import command as scenarios
+from flotilla.lab.scenarios import virtual
 from tests.unit.debian_archive import Archive, signing_keys
 
 NAME = "vortex"

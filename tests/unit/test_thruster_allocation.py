@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from flotilla.common import paths
-from lab.plants.plant import COMPILE
+from flotilla.lab.plants.plant import COMPILE
 
 SIGNAL = paths.PROJECT / "runtime" / "blocks" / "signal"
 MOST = 16

@@ -11,9 +11,9 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.debian import mirror, toolchain, tools
+from flotilla.debian.lock import Lock, Package, Suite
 from flotilla.fleet import inventory
-from images.builder import mirror, toolchain, tools
-from images.builder.lock import Lock, Package, Suite
 
 
 def test_tree_of_a_changed_package_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
-from images.builder import verify
+from flotilla.images import verify
 
 NOW = datetime.now(UTC)
 

@@ -19,7 +19,7 @@ from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet, Robot
-from lab.qemu import virtual_fleet as virtual
+from flotilla.lab.qemu import virtual_fleet as virtual
 
 SECONDS = 60
 """For what takes one or two: the machine may be busy."""
@@ -29,7 +29,7 @@ Start = Callable[..., "subprocess.Popen[str]"]
 def boots_for_ever(
     fleet: Fleet, robots: Sequence[Robot], directory: Path, ports: object = None, images: object = None
 ) -> Never:
-    """Guests, as `lab.qemu.virtual_fleet.running`: says what lay there before them, and when they end."""
+    """Guests, as `flotilla.lab.qemu.virtual_fleet.running`: says what lay there before them, and when they end."""
     print(*sorted(path.name for path in directory.iterdir()), flush=True)
     try:
         while True:

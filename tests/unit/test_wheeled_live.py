@@ -13,10 +13,10 @@ import pytest
 
 from flotilla.common.errors import UserError
 from flotilla.fleet import inventory
+from flotilla.lab.wheeled import live, plant
+from flotilla.lab.wheeled.by_wires import INVENTORY
+from flotilla.lab.wheeled.virtual import COMMAND_PORT
 from flotilla.station import telemetry
-from lab.wheeled import live, plant
-from lab.wheeled.by_wires import INVENTORY
-from lab.wheeled.virtual import COMMAND_PORT
 
 STATION = IPv4Address("10.43.0.254")
 

@@ -1,5 +1,5 @@
 /* The engine against a drive of few lines: what the engine sends, in which order, and what it makes of the answers.
- * lab/emulators/epos2.py is the complete drive, which the block is tested against. */
+ * flotilla/lab/emulators/epos2.py is the complete drive, which the block is tested against. */
 #include "blocks/can/epos2.h"
 #include "testbed.h"
 

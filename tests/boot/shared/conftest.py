@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from flotilla.debian import kernel
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board
-from images.builder import card, kernel
+from flotilla.images import card
 from tests import figures
 from tests.boot.guests import PENTIUM, label, sh
 from tests.conftest import GuestFactory, RobotGuest

@@ -6,8 +6,8 @@ import re
 import shlex
 
 from flotilla.fleet.model import Board
-from images.builder import card
-from images.builder.manifest import Manifest
+from flotilla.images import card
+from flotilla.images.manifest import Manifest
 from tests.boot.guests import SECONDS, boot_state, label, nothing_failed, sh, tries
 from tests.boot.shared.conftest import Report
 from tests.conftest import RobotGuest

@@ -15,10 +15,10 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.fleet.model import Board, Can, Fleet, Port
+from flotilla.lab.acceptance import checks, command, facts, outcome
+from flotilla.lab.latency import report, run
+from flotilla.lab.latency import results as latency_results
 from flotilla.robot import ssh
-from lab.acceptance import checks, command, facts, outcome
-from lab.latency import report, run
-from lab.latency import results as latency_results
 from tests.boot.guests import sh
 from tests.conftest import RobotGuest
 

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from images.builder import card
-from lab.qemu import qemu
+from flotilla.images import card
+from flotilla.lab.qemu import qemu
 from tests.boot.guests import sh
 from tests.conftest import RobotGuest
 
