@@ -123,7 +123,7 @@ deploy: | setup ## build an app, copy it to a robot and start it | ROBOT=3 APP=d
 	    $(if $(filter-out 0,$(KEEP)),--keep) $(if $(filter-out 0,$(ON_ROBOT)),--on-robot)
 
 ##@ Inputs
-.PHONY: init lock cve check-fleet requirements
+.PHONY: init lock cve check-fleet requirements wheel
 init: | setup ## make a directory for a fleet of your own | FLEET=dir
 	$(Q)$(FLOTILLA) init $(call need,FLEET)
 
@@ -137,16 +137,26 @@ check-fleet: | setup ## validate the inventory
 	$(Q)$(FLOTILLA) check-fleet
 
 # One resolution of all groups, which keeps what is locked, then the part of each: no two have different versions.
-all_inputs = requirements/build.in requirements/station.in requirements/tests.in
+of_build = pyproject.toml --group setup
+of_station = $(of_build) --extra station
+of_tests = $(of_station) --group tests
 locked = $(PYTHON) images/pip_settings.py $(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes \
     --no-emit-index-url --no-header --no-annotate --quiet
-requirements: | setup ## lock the Python packages again from requirements/*.in
-	$(Q)cat $(all_inputs:in=lock) >$(BUILD)/requirements.lock
-	$(Q)$(locked) $(all_inputs) -o $(BUILD)/requirements.lock
-	$(Q)set -e; for each in $(all_inputs:.in=); do \
-	    $(locked) -c $(BUILD)/requirements.lock $$each.in -o $$each.lock; done
-	$(Q)$(subst --universal,--python-platform x86_64-manylinux_2_28,$(locked)) requirements/ros.in -o requirements/ros.lock
-	$(Q)$(locked) requirements/fuzz.in -o requirements/fuzz.lock
+requirements: | setup ## lock the Python packages that pyproject.toml names again
+	$(Q)cat requirements/build.lock requirements/station.lock requirements/tests.lock >$(BUILD)/requirements.lock
+	$(Q)$(locked) $(of_tests) -o $(BUILD)/requirements.lock
+	$(Q)set -e; $(foreach each,build station tests,\
+	    $(locked) -c $(BUILD)/requirements.lock $(of_$(each)) -o requirements/$(each).lock;)
+	$(Q)$(subst --universal,--python-platform x86_64-manylinux_2_28,$(locked)) --group ros -o requirements/ros.lock
+	$(Q)$(locked) --group fuzz -o requirements/fuzz.lock
+
+# A package of the tool for computers without this checkout, and the versions of its dependencies that were tested.
+dist = $(BUILD)/dist
+wheel: | setup ## build the Python package of this tool in build/dist
+	$(Q)rm -rf $(dist)
+	$(Q)$(step) "package" $(PYTHON) -m hatchling build -d $(abspath $(dist))
+	$(Q)sed -n 's/^\([A-Za-z0-9_.-]*==[^\\]*[^ \\]\).*/\1/p' requirements/station.lock >$(dist)/constraints.txt
+	$(Q)cd $(dist) && sha256sum * >SHA256SUMS && cat SHA256SUMS
 
 ##@ Keys
 .PHONY: rotate-key revoke-key admit-operator revoke-operator operators backup-keys restore-keys
@@ -404,13 +414,13 @@ setup-station: $(VENV)/.station ## install what a station needs: page, recording
 
 # Each command installs what it needs: guests, the runtime for this computer, a browser for the tests of pages.
 setup-lab: setup ## install what QEMU guests need
-	$(Q)images/install-host-packages tests/lab-packages.txt
+	$(Q)images/install-host-packages flotilla/lab/host-packages.txt
 
 setup-runtime: setup ## install what compiling the runtime needs
-	$(Q)images/install-host-packages tests/runtime-packages.txt
+	$(Q)images/install-host-packages runtime/host-packages.txt
 
 setup-tests: $(VENV)/.tests ## install what the tests need
-	$(Q)images/install-host-packages tests/host-packages.txt tests/lab-packages.txt tests/runtime-packages.txt
+	$(Q)images/install-host-packages tests/host-packages.txt flotilla/lab/host-packages.txt runtime/host-packages.txt
 
 clean: ## remove all outputs except keys
 	$(Q)rm -rf $(BUILD)

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+HostList = Literal["build", "lab", "runtime"]
+
 
 def no_arguments(_: argparse.ArgumentParser) -> None:
     """Of a command that takes none."""
@@ -23,6 +25,8 @@ class Command:
     run: Callable[[argparse.Namespace], None]
     """Does it; prints the result on standard output, raises UserError where the user can help."""
     arguments: Callable[[argparse.ArgumentParser], None] = no_arguments
+    host: tuple[HostList, ...] = ("build",)
+    """Lists of the Debian packages that it needs on this computer, see `flotilla.cli.host_packages`."""
     packages: Literal["build", "station"] = "build"
     """The group of requirements/ that has the Python packages which both functions import."""
     root: bool = False

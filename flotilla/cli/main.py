@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from itertools import groupby
 
+from flotilla.cli import host_packages
 from flotilla.cli.command import Command
 from flotilla.common import paths, sudo
 from flotilla.common.errors import UserError
@@ -70,6 +71,7 @@ def main() -> int:
         caller = sudo.caller()
         if caller and not command.root:
             raise sudo.refusal(f"flotilla {command.name}")
+        host_packages.install(command)
         try:
             command.run(arguments)
         finally:
@@ -88,8 +90,9 @@ def main() -> int:
         module = (error.name or "").split(".")[0]
         if group == "build" or module in OURS:
             raise
+        remedy = f'pip install "flotilla[{group}]"' if paths.INSTALLED else f"make setup-{group}"
         print(
-            f"error: flotilla {word}: the Python package {module} is not installed; `make setup-{group}` installs it",
+            f"error: flotilla {word}: the Python package {module} is not installed; `{remedy}` installs it",
             file=sys.stderr,
         )
         return 1

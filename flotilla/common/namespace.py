@@ -205,7 +205,7 @@ def run_stage(module: str, arguments: Sequence[str], log: Path) -> None:
         "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
         "LC_ALL": "C.UTF-8",
         "TZ": "UTC",
-        "PYTHONPATH": str(paths.PROJECT),
+        "PYTHONPATH": str(paths.IMPORTS),
     }
     environment |= {name: os.environ[name] for name in ("FLEET", "BUILD", "V") if name in os.environ} | moved_clock()
     run_logged(module, argv, log, environment)

@@ -1,8 +1,9 @@
 """Where things lie. Every other module asks here; `FLEET`, `BUILD`, `KEYS`, `APPS` and `INVENTORY` come from the
 environment.
 
-A fleet has a home: a directory that its owner keeps in a repository of its own. `FLEET` names it; without `FLEET` it is
-this checkout, with the example fleet.
+A fleet has a home: a directory that its owner keeps in a repository of its own. `FLEET` names it. Without `FLEET` it is
+this checkout, with the example fleet; a tool that was installed as a package has no such fleet, and takes the current
+directory.
 
 | in a home | in the checkout |
 |---|---|
@@ -23,12 +24,19 @@ from pathlib import Path
 from flotilla.common.errors import UserError
 
 PACKAGE = Path(__file__).resolve().parents[1]
-"""This package's own modules and data."""
-PROJECT = PACKAGE.parent
-HOME = Path(os.environ.get("FLEET") or PROJECT).resolve()
+"""The modules of this tool."""
+IMPORTS = PACKAGE.parent
+"""The directory from which Python imports them."""
+INSTALLED = (PACKAGE / "tool").is_dir()
+"""Whether the tool was installed as a package. Otherwise it runs from its checkout."""
+PROJECT = PACKAGE / "tool" if INSTALLED else IMPORTS
+"""The files of the tool that are no modules: those of its checkout; pyproject.toml has the list for a package."""
+HOME = Path(os.environ.get("FLEET") or ("." if INSTALLED else PROJECT)).resolve()
 """The fleet's home."""
 OWN_HOME = HOME != PROJECT
-"""Whether the fleet lies outside of this checkout."""
+"""Whether the fleet lies outside of this tool."""
+CHECKOUT = HOME if INSTALLED else PROJECT
+"""The directory in which a user works."""
 HOME_FILE = "fleet.yml"
 """The file that makes a directory a home; a home that is this checkout has none."""
 
@@ -101,9 +109,9 @@ def _unfit(path: Path) -> bool:
 
 
 def shown(path: Path) -> str:
-    """The path as a message should show it: relative to the project where it lies inside."""
+    """The path as a message should show it: relative to `CHECKOUT` where it lies inside."""
     try:
-        return str(path.relative_to(PROJECT))
+        return str(path.relative_to(CHECKOUT))
     except ValueError:
         return str(path)
 

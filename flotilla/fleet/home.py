@@ -40,8 +40,10 @@ def check() -> None:
         return
     file = paths.HOME / paths.HOME_FILE
     if not file.is_file():
-        remedy = f"name a fleet's directory, or make one: make init FLEET={paths.HOME}"
-        raise UserError(f"FLEET={paths.HOME}: has no {paths.HOME_FILE}; {remedy}")
+        command = "flotilla init DIRECTORY" if paths.INSTALLED else f"make init FLEET={paths.HOME}"
+        raise UserError(
+            f"FLEET={paths.HOME}: has no {paths.HOME_FILE}; name a fleet's directory, or make one: {command}"
+        )
     wanted, ours = yaml_file.read(file, _File).flotilla, version("flotilla")
     if _numbers(wanted) > _numbers(ours):
         raise UserError(f"{file}: flotilla: {wanted}: this is version {ours}; use version {wanted} or a newer one")
@@ -67,7 +69,8 @@ def make(directory: Path) -> str:
     if directory.exists():
         directory.rmdir()
     durable.rename(beside, directory)
-    return f"{directory} is the home of the fleet {name}; build its robot's card: make image ROBOT=1 FLEET={directory}"
+    command = f"cd {directory} && flotilla image 1" if paths.INSTALLED else f"make image ROBOT=1 FLEET={directory}"
+    return f"{directory} is the home of the fleet {name}; build its robot's card: {command}"
 
 
 def _change(file: Path, old: str, new: str) -> None:

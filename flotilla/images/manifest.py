@@ -16,6 +16,7 @@ import sys
 import uuid
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Protocol
 from urllib.parse import quote
@@ -539,12 +540,15 @@ def of_home() -> Source | str:
 
 
 def checkout(directory: Path = paths.PROJECT, entering: Sequence[str] = _ENTERING) -> Source | str:
-    """Commit and cleanliness of the checkout that `directory` is the top of; why they are unknown otherwise.
+    """Commit and cleanliness of the checkout that `directory` is the top of; why they are unknown otherwise. Of a tool
+    that was installed: its version.
 
     Another user may own the checkout. So no command of git's reads more than its objects: the others run programs that
     the repository's configuration names (core.fsmonitor, filters). And git would leave out the files that it
     ignores, which are in the image all the same.
     """
+    if directory == paths.PROJECT and paths.INSTALLED:
+        return f"installed: flotilla {version('flotilla')}"
     try:
         top, commit = _git(directory, "rev-parse", "--show-toplevel", "HEAD").decode().splitlines()
         if Path(top).resolve() != directory.resolve():  # unpacked inside somebody else's repository

@@ -179,7 +179,7 @@ def _prepare(directory: Path, board: Board, robot: Robot, *, plant: bool) -> tup
     elif paths.APPS != paths.PROJECT / "apps" and paths.APPS.exists():
         shutil.copytree(paths.APPS, directory / "checkout/apps", symlinks=True, copy_function=_copy_as_cloned)
     if plant:
-        overlay = directory / "checkout" / paths.OVERLAY.relative_to(paths.PROJECT)
+        overlay = directory / "checkout" / paths.OVERLAY.relative_to(paths.IMPORTS)
         (overlay / _PLANTED).write_text(f"{datetime.now(UTC)}\n")
     keys.copy_for_image(robot, directory / "keys")
     lock, tools_lock = board_lock(board), read_lock("tools")
@@ -208,8 +208,9 @@ def _prepare(directory: Path, board: Board, robot: Robot, *, plant: bool) -> tup
 
 
 def copy_checkout(copy: Path) -> None:
-    """The checkout without outputs, keys and history, and with the modes that a clone under the other umask has."""
-    _copy(paths.PROJECT, copy)
+    """The checkout without outputs, keys and history, and with the modes that a clone under the other umask has. Of a
+    tool that was installed: the package."""
+    _copy(paths.PACKAGE if paths.INSTALLED else paths.PROJECT, copy / "flotilla" if paths.INSTALLED else copy)
 
 
 def _copy(directory: Path, copy: Path) -> None:
@@ -315,7 +316,7 @@ def _run(circumstances: _Circumstances, log: Path) -> None:
     description.write_text(json.dumps(asdict(circumstances)))
     sudo = _sudo() if os.geteuid() != 0 else []
     prefix = namespace.prefix("--uts", "--mount-proc", root=os.geteuid() == 0 or bool(sudo))
-    argv = [*sudo, *prefix, "env", f"PYTHONPATH={paths.PROJECT}", sys.executable, "-m", __name__, str(description)]
+    argv = [*sudo, *prefix, "env", f"PYTHONPATH={paths.IMPORTS}", sys.executable, "-m", __name__, str(description)]
     namespace.run_logged("the second build", argv, log)
 
 

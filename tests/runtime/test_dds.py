@@ -57,7 +57,7 @@ Start = Callable[..., Any]
 @pytest.fixture
 def start(flotilla_run: Path, tmp_path: Path) -> Start:
     plugin = flotilla_run.parent / "dds.so"
-    assert plugin.exists(), "the runtime was built without Cyclone DDS, which tests/runtime-packages.txt names"
+    assert plugin.exists(), "the runtime was built without Cyclone DDS, which runtime/host-packages.txt names"
 
     blocks = str(flotilla_run.parent)
     environment = {"CYCLONEDDS_URI": DDS_ON_LOOPBACK}

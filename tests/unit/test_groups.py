@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import tomllib
 from collections.abc import Callable, Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -144,8 +145,11 @@ def test_groups_agree_on_versions_and_name_the_direct_ones_once() -> None:
     marked = set(re.findall(r"^(\S+)==\S+ ; python", text, re.MULTILINE))  # another version for another Python
     names = [line.split("==")[0] for line in every]
     assert {name for name in names if names.count(name) > 1} <= marked
-    direct = [normal(name) for group in GROUPS for name in
-              re.findall(r"^([\w.-]+)", (REQUIREMENTS / f"{group}.in").read_text(), re.MULTILINE)]  # fmt: skip
+    described = tomllib.loads((paths.PROJECT / "pyproject.toml").read_text())
+    project, groups = described["project"], described["dependency-groups"]
+    lists = [project["dependencies"], project["optional-dependencies"]["station"], groups["setup"], groups["tests"]]
+    direct = [normal(re.split(r"[<=\[]", each)[0]) for names in lists for each in names]
+    assert len(direct) > len(GROUPS)
     assert len(direct) == len(set(direct))
 
 

@@ -212,6 +212,7 @@ def test_a_checkout_on_such_a_path_is_refused_at_once(tmp_path: Path, folder: st
     """By make, and by the program. Seen to fail: make installed an environment elsewhere, and a card had no keys."""
     checkout = tmp_path / folder / "flotilla"
     shutil.copytree(paths.PROJECT / "flotilla" / "common", checkout / "flotilla" / "common")
+    (checkout / "flotilla/__init__.py").touch()
     shutil.copy(paths.PROJECT / "Makefile", checkout)
     before = sorted(checkout.rglob("*"))
     for words in (["image", "ROBOT=3"], ["setup"], ["help"]):
@@ -232,6 +233,7 @@ def test_a_checkout_on_such_a_path_is_refused_at_once(tmp_path: Path, folder: st
 @pytest.mark.parametrize("folder", ["ü", "日本", "a-b_c.d,e+f@g~h"])
 def test_a_checkout_on_another_path_is_none_of_those(tmp_path: Path, folder: str) -> None:
     shutil.copytree(paths.PROJECT / "flotilla" / "common", tmp_path / folder / "flotilla" / "common")
+    (tmp_path / folder / "flotilla/__init__.py").touch()
     shutil.copy(paths.PROJECT / "Makefile", tmp_path / folder)
     subprocess.run(["make", "-C", str(tmp_path / folder), "help"], stdout=subprocess.DEVNULL, check=True)
     argv = [sys.executable, "-c", "from flotilla.common import paths; paths.check()"]

@@ -164,7 +164,7 @@ def stage(directory: Path, image: Path, log: Path) -> Sample:
 
 def environment(directory: Path) -> Mapping[str, str]:
     """For processes that are to leave the real fleet's keys and reports alone."""
-    return os.environ | {"BUILD": str(directory), "KEYS": str(directory / "keys"), "PYTHONPATH": str(paths.PROJECT)}
+    return os.environ | {"BUILD": str(directory), "KEYS": str(directory / "keys"), "PYTHONPATH": str(paths.IMPORTS)}
 
 
 def image_for(fleet: Fleet, board: str) -> Path:

@@ -21,7 +21,7 @@ from flotilla.lab.latency.subject import DIRECTORY
 
 BASELINE = Path(__file__).with_suffix(".json")
 """The accepted histogram of the whole chain, from a frame's first byte to the valve."""
-PLUGIN = paths.PROJECT / "runtime" / "tests" / "plugin" / "loopback.c"
+PLUGIN = Path(__file__).with_name("loopback.c")
 SECONDS = 5
 
 CHAIN = """
@@ -162,7 +162,7 @@ def run(board: Board, out: Path) -> dict[str, str]:
         "drive.py": DRIVE.encode(),
         "loopback.so": runtime.compile_plugin(PLUGIN, board.system),
     }
-    files |= {name: (paths.PROJECT / name).read_bytes() for name in EMULATOR}
+    files |= {name: (paths.IMPORTS / name).read_bytes() for name in EMULATOR}
     files |= flood.files(board, DIRECTORY)
     measured = subject.build(board)
     out.mkdir(parents=True, exist_ok=True)

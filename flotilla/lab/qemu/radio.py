@@ -74,7 +74,7 @@ class Node:
         """Start a program on that computer; `more`: further variables of its environment."""
         return subprocess.Popen(
             [*self.prefix, *map(str, argv)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=cwd,
-            env={**os.environ, "PYTHONPATH": str(paths.PROJECT), **(more or {})}, stdin=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": str(paths.IMPORTS), **(more or {})}, stdin=subprocess.DEVNULL,
         )  # fmt: skip
 
     def close(self) -> None:
