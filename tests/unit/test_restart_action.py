@@ -66,6 +66,17 @@ def test_a_robot_that_does_not_come_up_is_named(make: Make, monkeypatch: pytest.
     assert result["msg"].startswith("robot3 was not up again after 120 s: ")
 
 
+def test_a_robot_that_does_not_restart_is_named(make: Make) -> None:
+    """With its answer in a form that can be displayed."""
+    action = make("600")
+    action._low_level_execute_command = lambda *_, **__: {"rc": 1, "stdout": "", "stderr": "no \x1b[2Jentry"}
+    result = action.run(None, {"inventory_hostname": "robot3"})
+    assert result["failed"]
+    assert result["msg"].startswith("robot3: ")
+    assert "no \\x1b[2Jentry" in result["msg"]
+    assert "\x1b" not in result["msg"]
+
+
 @pytest.mark.parametrize("timeout_s", ["0", "-1", "1.5", "long", ""])
 def test_a_limit_of_time_is_a_number_of_seconds(make: Make, timeout_s: str) -> None:
     action = make(timeout_s)

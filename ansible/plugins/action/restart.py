@@ -11,6 +11,7 @@ from typing import Any
 from ansible.errors import AnsibleActionFail
 
 from ansible.plugins.action import reboot
+from flotilla.common import text
 
 
 class ActionModule(reboot.ActionModule):  # type: ignore[misc]  # Ansible has no types
@@ -25,9 +26,11 @@ class ActionModule(reboot.ActionModule):  # type: ignore[misc]  # Ansible has no
             raise AnsibleActionFail(f"timeout_s={given}: give seconds, a whole number from 1 on")
         self.DEFAULT_REBOOT_TIMEOUT = int(given)
         result: dict[str, Any] = super().run(tmp, task_vars)
+        name = (task_vars or {})["inventory_hostname"]
         if result.get("failed") and result.get("rebooted"):
-            name = (task_vars or {})["inventory_hostname"]
             result["msg"] = f"{name} was not up again after {given} s: look at it, or give it more: -e timeout_s=1800"
+        elif result.get("failed"):
+            result["msg"] = f"{name}: {text.shown(str(result['msg']))}"
         return result
 
     def get_distribution(self, task_vars: dict[str, Any]) -> dict[str, str]:
