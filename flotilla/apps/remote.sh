@@ -67,7 +67,7 @@ as_app() (
         setpriv --reuid=app --regid=app --clear-groups --bounding-set=-all --inh-caps=-all --no-new-privs "$@"
 )
 
-# Refuse a program that does not find its libraries and functions, or that ldd cannot check. A static one needs none.
+# End with status 3 if a program does not find its libraries and functions, or ldd cannot check it. A static one needs none.
 loads() {
     found=$({ as_app ldd -r "$part/$1" 2>&1 && echo checked || echo "ended with status $?"; } | tail -c 1M)
     case $found in
