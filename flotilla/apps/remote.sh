@@ -67,6 +67,23 @@ as_app() (
         setpriv --reuid=app --regid=app --clear-groups --bounding-set=-all --inh-caps=-all --no-new-privs "$@"
 )
 
+# End with status 3 if a program does not find its libraries and functions, or ldd cannot check it. A static one needs none.
+loads() {
+    found=$({ as_app ldd -r "$part/$1" 2>&1 && echo checked || echo "ended with status $?"; } | tail -c 1M)
+    case $found in
+    *"not found"* | *"undefined symbol"*)
+        printf '%s\n' "$found" | grep -e "not found" -e "undefined symbol" >&2
+        refuse "$1 needs libraries or functions that are missing on the robot; nothing was changed"
+        ;;
+    checked | *"
+checked" | *"not a dynamic executable"*) ;;
+    *)
+        printf '%s\n' "$found" >&2
+        refuse "$1 cannot be checked on the robot by ldd; nothing was changed"
+        ;;
+    esac
+}
+
 # Take the app's files from standard input, and put them in the place of what is there once nothing can fail any more:
 # VERSION of the files, KiB that must be free, PROGRAM or nothing.
 receive() {
@@ -84,10 +101,7 @@ receive() {
         [ ! -e "$task" ] || as_app flotilla-run --check --blocks "$part/blocks:/usr/lib/flotilla/blocks" "$task" ||
             refuse "its runtime refuses the app; nothing was changed"
     done
-    if [ "$program" ]; then
-        ! as_app ldd -r "$part/$program" 2>&1 | grep -e "not found" -e "undefined symbol" >&2 ||
-            refuse "$program needs libraries or functions that are missing on the robot; nothing was changed"
-    fi
+    [ -z "$program" ] || loads "$program"
     sync -f "$part"
 
     reload=

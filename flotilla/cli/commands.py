@@ -136,9 +136,9 @@ def _bundle(arguments: argparse.Namespace) -> None:
 
 
 def _day(text: str) -> date:
-    from datetime import date
+    from flotilla.common.text import day
 
-    return date.fromisoformat(text)
+    return day(text)
 
 
 _day.__name__ = "YYYY-MM-DD"  # in argparse's errors

@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -30,6 +31,8 @@ _DELAYS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Before each further try of a host from which nothing came, 31 s in all."""
 _RETRY_AFTER_S = 60.0
 """The longest wait that a server may ask for (Retry-After)."""
+_DATES = ("%a, %d %b %Y %H:%M:%S GMT", "%A, %d-%b-%y %H:%M:%S GMT", "%a %b %d %H:%M:%S %Y")
+"""Forms of a date in Retry-After (RFC 9110, section 5.6.7)."""
 _CONNECT_S = 15
 """To reach a host and to get its first byte."""
 _SILENCE_S = 30
@@ -253,8 +256,8 @@ class _Call:
         reasons = dict(re.findall(r"^Err:\d+ (\S+).*\n {2}(.*)", output, re.MULTILINE))
         if full := [errno for errno in _DISK_FULL if any(os.strerror(errno) in each for each in reasons.values())]:
             raise OSError(full[0], os.strerror(full[0]))
-        asked = re.findall(r"^Retry-After: *(\d+)\s*$", debug, re.MULTILINE | re.IGNORECASE)
-        self.retry_after = max(map(float, asked), default=0.0)
+        asked = re.findall(r"^Retry-After:(.*)$", debug, re.MULTILINE | re.IGNORECASE)
+        self.retry_after = max(map(_seconds, asked), default=0.0)
         for file, address in self._addresses.items():
             reason = reasons.get(_for_apt(address))
             if reason is not None:
@@ -280,6 +283,17 @@ class _Call:
             kind, reason = (PAGE, "has a page of HTML") if page else (kind, _difference(file, received))
         received.unlink(missing_ok=True)
         self.failures[file] = kind, reason
+
+
+def _seconds(retry_after: str) -> float:
+    """Of the header's value: a number, or a date in a form of RFC 9110. Zero for any other value."""
+    value = retry_after.strip()
+    if re.fullmatch("[0-9]+", value):
+        return float(value)
+    for form in _DATES:
+        with suppress(ValueError):
+            return datetime.strptime(value, form).replace(tzinfo=UTC).timestamp() - _now()
+    return 0.0
 
 
 def _difference(file: File, received: Path) -> str:
@@ -321,3 +335,4 @@ def _sha256(path: Path) -> str:
 
 
 _sleep = time.sleep
+_now = time.time

@@ -17,7 +17,6 @@ import pydantic
 
 from flotilla.common import cache, namespace, paths, progress, sandbox, sources, together
 from flotilla.common.errors import UserError
-from flotilla.common.processes import content
 from flotilla.debian import chroot, pool, runtime_stage, toolchain, tools
 from flotilla.debian.lock import HOST, Lock, read_lock, runtime_lock
 from flotilla.fleet.model import System
@@ -218,10 +217,9 @@ def _run(system: System, needed: Sequence[Path], program: str, *arguments: str) 
     environment = {"LC_ALL": "C.UTF-8", "PATH": "/usr/bin"}
     needed = [tree, programs, *needed]
     sandboxed = sandbox.command([*argv, *arguments], sandbox.CHECK, readable=needed, environment=environment)
-    # Into files, to which the limit applies.
-    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as said:
-        done = subprocess.run(sandboxed, stdin=subprocess.DEVNULL, stdout=output, stderr=said, check=False)
-        return subprocess.CompletedProcess(done.args, done.returncode, content(output), content(said))
+    return subprocess.run(
+        sandboxed, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", errors="replace", check=False
+    )
 
 
 def source_files() -> list[Path]:

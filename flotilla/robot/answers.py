@@ -87,11 +87,17 @@ class Slot(_Answer):
     kernel: Text | None
 
 
+class Slots(_Answer):
+    A: Slot
+    B: Slot
+
+
 class Release(_Answer):
     """What `flotilla-slot show` says."""
 
     running: Literal["A", "B"] | None
-    slots: dict[Literal["A", "B"], Slot]
+    trial: Literal["A", "B"] | None
+    slots: Slots
 
 
 class State(_Answer):

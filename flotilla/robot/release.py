@@ -16,6 +16,7 @@ from typing import Any
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.common.text import day
 from flotilla.fleet.model import Robot
 
 
@@ -109,15 +110,24 @@ def read(path: Path) -> Bundle:
                 for name, member in members.items()
                 if name.startswith("manifest.json")
             }
+        manifest = json.loads(texts["manifest.json"])
+        size = int(manifest["header"]["BYTES"])
     except FileNotFoundError:
         raise UserError(f"{paths.shown(path)} is missing; make it: `make bundle BOARD={path.stem}`") from None
-    except (KeyError, tarfile.TarError, UnicodeDecodeError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError, tarfile.TarError) as error:
         raise UserError(f"{paths.shown(path)} is no bundle: {error!r}; make it again: `make bundle`") from error
-    signatures = tuple(text for name, text in sorted(texts.items()) if name.endswith(".sig"))
-    bundle = Bundle(path, texts["manifest.json"], signatures, content.offset_data)
-    if content.size != int(bundle.header["BYTES"]):
+    signatures = tuple(each for name, each in sorted(texts.items()) if name.endswith(".sig"))
+    if content.size != size:
         raise UserError(f"{paths.shown(path)} is cut off; make it again: `make bundle BOARD={path.stem}`")
-    return bundle
+    try:
+        if "expires" in manifest:
+            day(manifest["expires"])
+    except ValueError as error:
+        raise UserError(
+            f"{paths.shown(path)}: manifest.json: expires={manifest['expires']}: {error}; make the bundle again: `make "
+            f"bundle BOARD={path.stem}`"
+        ) from None
+    return Bundle(path, texts["manifest.json"], signatures, content.offset_data)
 
 
 def same_number(before: Bundle, after: Bundle) -> str:

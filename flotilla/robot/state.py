@@ -87,6 +87,6 @@ def release_drift(found: dict[str, Any] | None, wanted: str | None) -> str:
     if runs["blob"] == wanted:
         return ""
     return (
-        f"runs release {runs['release']} with kernel {runs['kernel']} and content {runs['blob'][:16]}, its image here "
-        f"is {wanted[:16]}: make bundle, make update"
+        f"runs release {runs['release']} with kernel {runs['kernel']} and content {str(runs['blob'])[:16]}, its image "
+        f"here is {wanted[:16]}: make bundle, make update"
     )

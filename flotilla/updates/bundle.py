@@ -24,6 +24,7 @@ from pathlib import Path
 
 from flotilla.common import cache, durable, host, namespace, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.text import day
 from flotilla.fleet import release_keys, ssh_signatures
 from flotilla.fleet.model import Board, Fleet, Releases
 from flotilla.images import manifest, slot
@@ -70,8 +71,14 @@ def text_of(final: Path) -> Path:
 def expiry(releases: Releases, today: date, given: date | None, signed: Path | None) -> date:
     """Last day of a bundle: `given`, that of the manifest `signed` elsewhere, or as many days from `today` on as the
     inventory gives. UserError if it is over."""
-    there = signed is not None and signed.exists() and json.loads(signed.read_bytes()).get("expires")
-    last_day = given or (date.fromisoformat(there) if there else today + timedelta(days=releases.lifetime_days))
+    there = json.loads(signed.read_bytes()) if signed is not None and signed.exists() else {}
+    try:
+        chosen = day(there["expires"]) if "expires" in there else None
+    except ValueError as error:
+        raise UserError(
+            f"{paths.shown(signed or Path())}: expires={there['expires']}: {error}, and have the manifest signed again"
+        ) from None
+    last_day = given or chosen or today + timedelta(days=releases.lifetime_days)
     if last_day < today:
         source = "EXPIRES" if given or not signed else f"{paths.shown(signed)}: expires"
         raise UserError(

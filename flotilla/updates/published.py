@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from datetime import date
 from itertools import zip_longest
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
 
 import pydantic
 
 from flotilla.common import cache, host, namespace, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.text import day
 from flotilla.fleet import release_keys
 from flotilla.fleet.model import Fleet
 from flotilla.images import card
@@ -41,7 +42,7 @@ class Manifest(pydantic.BaseModel):
     """SHA-256 of each chunk of slot.img."""
     bills: dict[str, str] = {}
     """SHA-256 of the bills of materials, by their names in the bundle."""
-    expires: date | None = None
+    expires: Annotated[date | None, pydantic.BeforeValidator(day)] = None
     """Last day, which the publisher chose; nothing to compare with. None: the bundle does not expire."""
 
 

@@ -515,3 +515,54 @@ def test_a_robot_runs_no_code_of_an_app_as_root_to_check_it(tmp_path: Path) -> N
         done = subprocess.run(argv, env=environment, input=archive.getvalue(), capture_output=True, check=False)
         assert done.returncode, done.stderr
     assert log.read_text().splitlines() == ["flotilla-run as app alone", "head as app alone"]
+
+
+LDD = """#!/bin/sh
+[ "$AS" = app ] || exit 1
+printf '%b' '{text}'
+exit {status}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "isolated", "rejected"),
+    [
+        ("libc.so.6 => /lib/libc.so.6\\n", 0, True, ""),
+        ("\\tnot a dynamic executable\\n", 1, True, ""),
+        ("libx.so.1 => not found\\n", 0, True, "libx.so.1 => not found\nhover needs libraries or functions"),
+        ("libx.so.1 => not found\\n", 1, True, "libx.so.1 => not found\nhover needs libraries or functions"),
+        ("undefined symbol: f\\n" * 9000, 0, True, "hover needs libraries or functions"),
+        ("libc.so.6 => /lib/libc.so.6\\n", 1, True, "ended with status 1\nhover cannot be checked"),
+        ("", 124, True, "ended with status 124\nhover cannot be checked"),
+        ("libx.so.1 => not found\\n", 0, False, "unshare failed\nended with status 1\nhover cannot be checked"),
+    ],
+    ids=["whole", "static", "missing", "missing, status", "undefined", "status", "time", "not isolated"],
+)
+def test_a_program_that_a_robot_cannot_check_is_rejected(
+    tmp_path: Path, text: str, status: int, isolated: bool, rejected: str
+) -> None:
+    """Seen to fail where ldd or the isolation around it ended with an error: the program was put in place, whatever
+    libraries it needs."""
+    programs, apps, units = tmp_path / "bin", tmp_path / "apps", tmp_path / "units"
+    programs.mkdir()
+    units.mkdir()
+    isolation = ALONE if isolated else "#!/bin/sh\necho unshare failed >&2\nexit 1\n"
+    texts = {"ldd": LDD.format(text=text, status=status), "setpriv": AS_APP, "unshare": isolation}
+    for name, content in {**texts, "systemctl": "#!/bin/sh\n"}.items():
+        (programs / name).write_text(content)
+        (programs / name).chmod(0o755)
+    script = remote.SCRIPT.read_text().replace("/data/apps", str(apps)).replace("/etc/systemd/system", str(units))
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        add(tar, "hover")
+    done = subprocess.run(
+        ["sh", "-c", script, "flotilla", "receive", "hover", "1", "1", "hover"],
+        env=os.environ | {"PATH": f"{programs}:{os.environ['PATH']}"},
+        input=archive.getvalue(),
+        capture_output=True,
+        check=False,
+    )
+    said = done.stderr.decode()
+    assert (done.returncode, (apps / "hover").exists()) == ((3, False) if rejected else (0, True)), said
+    assert rejected in said
+    assert not rejected or said.endswith("; nothing was changed\n")

@@ -27,6 +27,7 @@ from flotilla.common import ansible, paths
 from flotilla.fleet import identity, inventory
 from flotilla.lab.containers import scale
 from tests.figures import PROPERTY
+from tests.runtime.test_update import CHUNK, header_of, manifest_of, pack
 from tests.station import on_loopback
 
 SECONDS = 600
@@ -43,15 +44,31 @@ for marker in re.findall("BECOME-SUCCESS-[a-z]+", words):
     print(marker, flush=True)
 if not sys.stdin.isatty():
     sys.stdin.buffer.read()
-sys.stdout.write(json.load(open("{answers}"))[robot])
+answer = json.load(open("{answers}"))[robot]
+if answer and "random/boot_id" in words:
+    answer += str(sum(1 for _ in open("{log}")))  # it has restarted since it was asked before
+sys.stdout.write(answer)
 """
+SLOT = {"ok": True, "blob": None, "release": "5", "kernel": None}
 HEALTHY: dict[str, Any] = {
     "drift": [], "hostname": "robot", "machine": "i686", "uarts": [f"ttyS{number}" for number in range(16)],
     "users": ["root"], "addresses": [], "firewall_is_loaded": False, "sysctl": [], "apps": {}, "down": [],
     "superfluous_tasks": [], "failed": [], "tasks": {}, "clock": {"synchronised": False, "offset_s": None},
-    "release": None, "data_is_writable": True, "data_free_bytes": 1 << 30, "boot_id": "x",
+    "release": {"running": "A", "trial": "A", "slots": dict.fromkeys("AB", SLOT)},
+    "data_is_writable": True, "data_free_bytes": 1 << 30, "boot_id": "x",
 }  # fmt: skip
 """So far that playbooks go on: its rules of the firewall are others."""
+
+TOLD: dict[str, Any] = {"missing": [], "base": "", "running": False, "staged": False}
+"""Answer about a release that the idle slot of the robot contains already."""
+SOME = {
+    "some orders": ["facts in a template", GOOD, "release of none"],
+    "some others": [
+        "a template as words", "trust", "drift of a traversal", "release", "superfluous_tasks", "nothing", "bytes",
+        "escapes alone", "chunks beyond all", "a base of a path", "a reason with escapes",
+    ],
+}  # fmt: skip
+"""Of each kind, for playbooks that take long."""
 
 
 def orders(planted: Path) -> dict[str, Any]:
@@ -104,7 +121,9 @@ def states() -> dict[str, Any]:
         "down": [["a"]],
         "tasks": {"flotilla-task@a.service": {"ActiveState": "active", "SubState": "x", "NRestarts": "0", "status": 7}},
         "tasks of a list": [],
-        "release": {"running": "A", "slots": {}},
+        "release": {"running": "A", "trial": "A", "slots": {}},
+        "release without a trial": {"running": "A", "slots": dict.fromkeys("AB", SLOT)},
+        "release of none": None,
         "release of a word": "A",
         "sysctl": [["a"]],
         "data_free_bytes": "many",
@@ -121,6 +140,19 @@ def states() -> dict[str, Any]:
     for name, text in {"escapes": "\x1b[2J\x1b]0;x\x07", "direction": "\u202egnp.exe", "markup": "<script>"}.items():
         found[name] = {"state": HEALTHY | {"hostname": text}}
     return found
+
+
+def releases() -> dict[str, Any]:
+    """Wrong answers about a release."""
+    changes: dict[str, Any] = {
+        "chunks of no release": {"missing": [7, 8]},
+        "a chunk twice": {"missing": [7, 7]},
+        "chunks beyond all": {"missing": [1 << 63]},
+        "chunks of words": {"missing": ["0"]},
+        "a base of a path": {"base": "../../../x", "missing": [0]},
+        "a reason with escapes": {"unchecked": "\x1b[2J", "missing": [7, 8]},
+    }
+    return {name: TOLD | change for name, change in changes.items()}
 
 
 def texts() -> dict[str, str]:
@@ -156,22 +188,27 @@ class Played:
     """All other new files."""
     asked: list[list[str]]
     """What ssh was started with."""
+    failed: set[str]
+    """Robots with that outcome, by the run's report."""
 
 
-Play = Callable[[str], Played]
+Play = Callable[..., Played]
+"""The playbook, and further words of the command."""
 
 
-@pytest.fixture(params=["orders", pytest.param("others", marks=pytest.mark.nightly)])
+@pytest.fixture
 def answers(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
     """By what is wrong with it. A playbook goes on after orders; after others it ends, as after any fault."""
-    well = {
+    well = TOLD | {
         "state": HEALTHY, "stdout": "", "rc": 0, "files": [], "stat": {"exists": True, "isdir": False, "checksum": "1"},
-        "content": base64.b64encode(b"recorded").decode(), "encoding": "base64",
+        "content": base64.b64encode(b"recorded").decode(), "encoding": "base64", "ping": "pong",
     }  # fmt: skip  # whatever module is asked
-    if request.param == "orders":
-        return {name: json.dumps(well | answer) for name, answer in orders(tmp_path / "planted").items()}
-    given = failures(tmp_path / "planted") | states()
-    return {name: json.dumps(well | answer) for name, answer in given.items()} | texts()
+    planted = tmp_path / "planted"
+    going_on = orders(planted)
+    given = going_on | failures(planted) | states() | releases()
+    found = {name: json.dumps(well | answer) for name, answer in given.items()} | texts()
+    of_kind = {"orders": list(going_on), "others": [name for name in found if name not in going_on]}
+    return {name: found[name] for name in (SOME | of_kind)[request.param]}
 
 
 @pytest.fixture
@@ -192,13 +229,13 @@ def play(tmp_path: Path, answers: dict[str, str]) -> Play:
                  "for robot in fleet.robots.values(): identity.render(fleet, robot)"]  # fmt: skip
     subprocess.run(make_keys, cwd=paths.PROJECT, env=environment, check=True)
 
-    def play(playbook: str) -> Played:
+    def play(playbook: str, *words: str) -> Played:
         log.write_text("")
         before = files(tmp_path) | files(paths.PROJECT / "ansible")
         argv = ["ansible-playbook", "-i", str(directory), "-e", f"ansible_ssh_executable={ssh}", "--forks", "16"]
         argv += ["-e", json.dumps({"waves": ["100%"]})]
         done = subprocess.run(
-            [*argv, f"{playbook}.yml"], cwd=paths.PROJECT / "ansible",
+            [*argv, f"{playbook}.yml", *words], cwd=paths.PROJECT / "ansible",
             env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=SECONDS, check=False,
         )  # fmt: skip
         own = tuple(str(tmp_path / "build/collected" / robot) + "/" for robot in robots)
@@ -207,7 +244,9 @@ def play(tmp_path: Path, answers: dict[str, str]) -> Play:
         new = {path for path in new if not str(path).startswith((reports, str(tmp_path / "home") + "/"))}
         inside = {path for path in new if str(path).startswith(own)}
         asked = [json.loads(line) for line in log.read_text().splitlines()]
-        return Played(done.stdout + done.stderr, inside, new - inside, asked)
+        told = json.loads((tmp_path / f"build/reports/{playbook}.json").read_text())["robots"]
+        failed = {name for name, robot in told.items() if robot["outcome"] in ("failed", "unreachable")}
+        return Played(done.stdout + done.stderr, inside, new - inside, asked, failed)
 
     return play
 
@@ -216,26 +255,59 @@ def files(directory: Path) -> set[Path]:
     return {path for path in directory.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
 
 
-@pytest.mark.parametrize(
-    "playbook", ["fleet", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("tasks", "reboot")), "collect"]
-)
+PLAYED = [
+    pytest.param("fleet", "orders", id="orders-fleet"),
+    pytest.param("collect", "orders", id="orders-collect"),
+    *(
+        pytest.param(playbook, given, id=f"{given}-{playbook}", marks=pytest.mark.nightly)
+        for given, playbooks in {
+            "orders": ["tasks"], "others": ["fleet", "tasks", "collect"],
+            "some orders": ["reboot", "replace", "update"], "some others": ["reboot", "replace", "update"],
+        }.items()
+        for playbook in playbooks
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("playbook", "answers"), PLAYED, indirect=["answers"])
 def test_nothing_that_a_robot_answers_is_executed_or_written_elsewhere(
     play: Play, answers: dict[str, str], tmp_path: Path, playbook: str, record_property: Callable[[str, str], None]
 ) -> None:
     """Seen to fail: `keys` of the answer's facts became an option of the next ssh; a recording's path led out."""
-    played = play(playbook)
+    runs = [play(playbook, *words) for words in calls(playbook, list(answers), tmp_path)]
     if playbook == "collect" and GOOD in answers:
-        assert [path.read_bytes() for path in played.own if path.match(f"*/{RECORDING}")] == [b"recorded"]
-    asked = {word for argv in played.asked for word in argv if word.startswith("HostKeyAlias=")}
-    assert len(asked) >= (1 if playbook == "reboot" else len(answers))  # one after the other, until one fails
+        assert [path.read_bytes() for path in runs[0].own if path.match(f"*/{RECORDING}")] == [b"recorded"]
+    if playbook in ("reboot", "update") and GOOD in answers:  # each was restarted, and then rejected
+        restarted = [argv for argv in runs[0].asked if "systemctl reboot" in argv[-1]]
+        assert len(restarted) >= len(runs[0].failed) == len(answers), runs[0].said
+    asked = {word for played in runs for argv in played.asked for word in argv if word.startswith("HostKeyAlias=")}
+    assert len(asked) == len(answers)
     assert not (tmp_path / "planted").exists()
-    assert played.outside == set()
-    assert "Traceback" not in played.said, played.said[played.said.index("Traceback") - 500 :][:3000]
-    assert "\x1b" not in played.said
-    for argv in played.asked:
-        assert f'UserKnownHostsFile="{tmp_path}/keys/known_hosts"' in argv
-        assert not any(word.startswith("ProxyCommand") for word in argv)
+    for played in runs:
+        assert played.outside == set()
+        assert "Traceback" not in played.said, played.said[played.said.index("Traceback") - 500 :][:3000]
+        assert "\x1b" not in played.said
+        assert set(re.findall(r"^(?:fatal|failed): \[(\w+)", played.said, re.MULTILINE)) >= played.failed
+        for argv in played.asked:
+            assert f'UserKnownHostsFile="{tmp_path}/keys/known_hosts"' in argv
+            assert not any(word.startswith("ProxyCommand") for word in argv)
     record_property(PROPERTY, f"rooted robots, {playbook}.yml: {len(answers)} answers, nothing executed or written")
+
+
+def calls(playbook: str, names: list[str], tmp_path: Path) -> list[list[str]]:
+    """Further words of the command, once for each run of a playbook."""
+    bound = ["-e", "timeout_s=1"]
+    if playbook == "reboot":
+        return [bound]
+    if playbook == "replace":  # waits for one robot; then it is fleet.yml
+        silent = [f"robot{number}" for number, name in enumerate(names, 1) if name in texts()]
+        alone = [[*bound, "-e", f"replaced={robot}", "-l", f"localhost,{robot}"] for robot in silent]
+        return [[*bound, "-e", "replaced=robot1"], *alone]
+    if playbook == "update":
+        blob = bytes(8 * CHUNK)
+        file = pack(tmp_path / "small.bundle", manifest_of(blob, header_of(blob)), [], blob)
+        return [[*bound, "-e", f"bundle={file}", "-e", "settle_s=0", *words] for words in ([], ["-e", "go=back"])]
+    return [[]]
 
 
 COMMANDS = {

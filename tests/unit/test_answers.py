@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from flotilla.common.errors import UserError
-from flotilla.robot import answers
+from flotilla.robot import answers, state
 
 TOLD: dict[str, Any] = {"missing": [0, 1], "base": "0" * 64, "running": False, "staged": False, "release": "1"}
 
@@ -33,6 +33,36 @@ def test_another_answer_is_refused_by_robot_and_member(change: dict[str, Any], n
     """Such a base would become part of a path of the station's."""
     with pytest.raises(UserError, match=rf"robot1: its answer is none of a robot's: {named}"):
         answers.judged("robot1", TOLD | change, answers.Told)
+
+
+SLOT = {"ok": True, "blob": None, "release": "1", "kernel": None}
+RELEASE: dict[str, Any] = {"running": "A", "trial": None, "slots": {"A": SLOT, "B": SLOT}}
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"slots": {}}, "slots.A"),
+        ({"slots": {"B": SLOT}}, "slots.A"),
+        ({"slots": {"A": SLOT}}, "slots.B"),
+        ({"trial": "C"}, "trial"),
+        ({"trial": 1}, "trial"),
+    ],
+)
+def test_boot_state_has_both_slots(change: dict[str, Any], named: str) -> None:
+    """Seen to fail: it was accepted, and the first look at the slot that is missing was an error without the robot's
+    name."""
+    assert answers.judged("robot1", RELEASE, answers.Release) == RELEASE
+    with pytest.raises(UserError, match=rf"robot1: its answer is none of a robot's: {named}:"):
+        answers.judged("robot1", RELEASE | change, answers.Release)
+    with pytest.raises(UserError, match=r"robot1: its answer is none of a robot's: trial: Field required"):
+        answers.judged("robot1", {name: each for name, each in RELEASE.items() if name != "trial"}, answers.Release)
+
+
+def test_a_running_slot_without_content_differs_from_the_image() -> None:
+    """Seen to fail: `TypeError: 'NoneType' object is not subscriptable`."""
+    shown = state.release_drift(answers.judged("robot1", RELEASE, answers.Release), "a" * 64)
+    assert shown.startswith("runs release 1 with kernel None and content None, its image here is aaaaaaaaaaaaaaaa")
 
 
 @pytest.mark.parametrize("answer", [None, [], "text", 1, {}])

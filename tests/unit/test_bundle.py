@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from flotilla.cli import commands
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Releases
 from flotilla.robot import release
-from flotilla.updates import bundle
+from flotilla.updates import bundle, published
 from tests.runtime.test_update import CHUNK, header_of, manifest_of
 from tests.runtime.test_update import pack as pack_signed
 
@@ -84,6 +85,52 @@ def test_a_bundle_is_expired_after_its_last_day(tmp_path: Path) -> None:
     made = release.read(pack_signed(tmp_path / "some.bundle", text, [], BLOB))
     assert made.expired(TODAY) == ""
     assert "release 5 expired on 2026-03-01" in made.expired(date(2026, 3, 2))
+
+
+FORMS = [
+    "20260828",
+    "2026-W35-5",
+    "2026-8-28",
+    "2026-08-28T00:00:00",
+    "28.08.2026",
+    " 2026-08-28",
+    "",
+    20260828,
+    None,
+    [DAY.isoformat()],
+]
+"""Of the last day of a bundle. Robots compare texts: 20260828 comes after each day that they write."""
+
+
+@pytest.mark.parametrize("form", FORMS, ids=str)
+def test_a_day_in_another_form_is_rejected(content: Path, tmp_path: Path, form: object) -> None:
+    """In a bundle, in a manifest that is signed elsewhere, and in a published bundle. Seen to fail: the station
+    accepted 20260828, which robots accept for ever; the signature of a manifest with it was called none."""
+    text = manifest_of(BLOB, header_of(BLOB), expires=form)
+    file = pack_signed(tmp_path / "some.bundle", text, [], BLOB)
+    wrong = r"some\.bundle: manifest\.json: expires=.*: give a day such as 2027-01-31"
+    with pytest.raises(UserError, match=wrong):
+        release.read(file)
+    with pytest.raises(UserError, match=r"some\.bundle: is no bundle: (?s:.*)expires"):
+        published._read(file)
+    signed = content / "some.manifest.json"
+    signed.write_text(text)
+    with pytest.raises(UserError, match=r"some\.manifest\.json: expires=.*: give a day such as 2027-01-31"):
+        bundle.expiry(RELEASES, TODAY, None, signed)
+
+
+@pytest.mark.parametrize("form", FORMS[:6])
+def test_the_option_has_the_form_of_the_manifest(form: str) -> None:
+    with pytest.raises(ValueError, match="such as 2027-01-31"):
+        commands._day(form)
+    assert commands._day(DAY.isoformat()) == DAY
+
+
+@pytest.mark.parametrize("text", ["[]", "{", "{}", '{"header": []}', '{"header": {"BYTES": "x"}}'])
+def test_a_bundle_with_another_manifest_is_none(tmp_path: Path, text: str) -> None:
+    """Seen to fail: in a traceback."""
+    with pytest.raises(UserError, match=r"some\.bundle is no bundle: .*; make it again: `make bundle`"):
+        release.read(pack_signed(tmp_path / "some.bundle", text, [], BLOB))
 
 
 def test_another_release_with_the_same_number_is_named(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +24,7 @@ from flotilla.debian.lock import Lock, Package, Suite
 from flotilla.debian.mirror import DEBIAN, SECURITY, Mirrors
 from tests.unit.fault_server import PAGE, Answer, FaultServer, certificate
 
+NOW = int(datetime(2026, 3, 1, tzinfo=UTC).timestamp())
 RELEASED = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 SUITES = (Suite(DEBIAN, "bookworm", RELEASED), Suite(SECURITY, "bookworm-security", RELEASED.replace(day=4)))
 
@@ -223,8 +225,34 @@ def test_waits_grow_up_to_a_bound(server: FaultServer, waits: list[float]) -> No
     assert len(server.requests) == len(waits) + 1, "one file is enough to find that out"
 
 
-@pytest.mark.parametrize(("asked", "waited"), [("7", 7.0), ("100000", 60.0), ("soon", 1.25)])
-def test_server_says_when_to_come_back(server: FaultServer, asked: str, waited: float, waits: list[float]) -> None:
+def at(seconds: int, form: str = "%a, %d %b %Y %H:%M:%S GMT") -> str:
+    """A time in the forms that RFC 9110 permits, so many seconds after NOW."""
+    return time.strftime(form, time.gmtime(NOW + seconds))
+
+
+@pytest.mark.parametrize(
+    ("asked", "waited"),
+    [
+        ("7", 7.0),
+        ("100000", 60.0),
+        ("1" * 400, 60.0),
+        (at(7), 7.0),
+        (at(7, "%A, %d-%b-%y %H:%M:%S GMT"), 7.0),
+        (at(7, "%a %b %e %H:%M:%S %Y"), 7.0),
+        (at(100000), 60.0),
+        (at(-7), 1.25),
+        ("soon", 1.25),
+        ("Fri, 31 Feb 2026 08:00:00 GMT", 1.25),
+        ("Sun, 01 Mar 2026 99999999999999999999:00:00 GMT", 1.25),
+        ("1 Mar 0001 00:00:00 GMT", 1.25),
+        ("Fri, 31 Dec 99999 08:00:00 GMT", 1.25),
+    ],
+)
+def test_server_says_when_to_come_back(
+    server: FaultServer, asked: str, waited: float, waits: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seen to fail: a date had no effect."""
+    monkeypatch.setattr(download, "_now", lambda: NOW)
     serve(server)
     server.fault = first(1, Answer(429, Retry_After=asked))
     pool.fill([LOCK], server.mirrors)

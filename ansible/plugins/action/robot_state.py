@@ -35,14 +35,14 @@ class ActionModule(ActionBase):  # type: ignore[misc]  # Ansible has no types
             policy = health.policy(task_vars.get("health", {}))
             arguments = state.arguments(place[0], fleet, robot, built, policy)
         except UserError as error:
-            raise AnsibleActionFail(str(error)) from error
+            raise AnsibleActionFail(str(error)) from None
         answer = self._execute_module("robot_state", arguments, task_vars=task_vars)
         if "state" not in answer:
             return answers.outcome(answer)
         try:
             found = answers.judged(robot.name, answer["state"], answers.State)
         except UserError as error:
-            raise AnsibleActionFail(str(error)) from error
+            raise AnsibleActionFail(str(error)) from None
         wanted = state.wanted(fleet, robot)
         for file in found["drift"]:
             file["role"] = provision.role_of(file["path"])
