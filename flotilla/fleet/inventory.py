@@ -474,7 +474,7 @@ def _addresses(raw: dict[str, Any]) -> Iterator[Finding]:
 def _devices(raw: dict[str, Any]) -> Iterator[Finding]:
     for name, robot in raw["robots"].items():
         board = raw["boards"].get(robot["board"], {})
-        ports, console = board.get("ports"), board.get("console", {}).get("tty")
+        ports, console = board.get("ports"), (board.get("console") or {}).get("tty")
         used = {
             ("robots", name, "devices", device, "port"): plug["port"]
             for device, plug in robot.get("devices", {}).items()

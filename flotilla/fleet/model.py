@@ -314,8 +314,9 @@ class Board(_Model):
     """`debian`: Debian's real-time kernel. `lean`: the one that `make kernel` builds from `kernel/NAME.yml`."""
     kernel_arguments: list[Item]
     """Kernel command line, in addition to the arguments of every card."""
-    console: Console
-    """Serial port of GRUB, kernel messages and login."""
+    console: Console | None = None
+    """Serial port of GRUB, kernel messages and login. Leave it out for a board without a serial port: GRUB and the
+    kernel then write to the monitor only, and login is by SSH only."""
     ports: Annotated[dict[str, Port], AfterValidator(_by_tty)]
     """Serial connectors, by the name printed on the board."""
     network_interface: Interface
@@ -342,6 +343,11 @@ class Board(_Model):
     def system(self) -> System:
         """What its programs are compiled for."""
         return System(self.architecture, self.suite)
+
+    @property
+    def console_tty(self) -> str:
+        """Kernel name of the console's port; empty for a board without a console."""
+        return self.console.tty if self.console else ""
 
     @property
     def machine(self) -> str:

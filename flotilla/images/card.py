@@ -168,10 +168,10 @@ def data(board: Board) -> Partition:
 
 def kernel_arguments(board: Board) -> list[str]:
     """The command line, but for what GRUB adds for the slot."""
-    console = f"console={board.console.tty},{board.console.baud}n8"
+    serial = [f"console={board.console.tty},{board.console.baud}n8"] if board.console else []
     stop = board.watchdog and board.watchdog.stop
     own = [f"flotilla.watchdog_stop={stop.port}:{stop.value:o}"] if stop else []  # for preinit
-    return [*COMMON_ARGUMENTS, *_isolation(board), *board.kernel_arguments, *own, "console=tty0", console]
+    return [*COMMON_ARGUMENTS, *_isolation(board), *board.kernel_arguments, *own, "console=tty0", *serial]
 
 
 def _isolation(board: Board) -> list[str]:

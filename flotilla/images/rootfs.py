@@ -92,7 +92,7 @@ def build(board: Board, lock: Lock, tools_lock: Lock) -> Path:
                 "others": [package.path for package in userland],
                 "kernel": own.package.name if own else lock.having("kernel")[0].path,
                 "disk_modules": None if own else board.disk_modules,
-                "console": board.console.tty,
+                "console": board.console_tty,
                 "tools": str(tools.tree(tools_lock)),
                 "repository": str(repository),
                 "out": str(out),
@@ -380,7 +380,8 @@ def _configure(stage: Stage, console: str) -> None:
     )  # fmt: skip
     stage.in_target("systemctl", "preset-all", "--preset-mode=full")
     stage.in_target("systemctl", "set-default", "multi-user.target")
-    stage.in_target("systemctl", "enable", f"serial-getty@{console}.service")
+    if console:
+        stage.in_target("systemctl", "enable", f"serial-getty@{console}.service")
     (stage.target / "data").mkdir()
     _link_moved_files(stage.target)
 

@@ -123,12 +123,12 @@ def render(found: Mapping[str, Sequence[str]], name: str) -> str:
         "processors": int(found["processors"][0]),
         "kernel": "debian",
         "kernel_arguments": _kernel_arguments(ports),
-        "console": {"tty": tty or "ttyS0", "baud": 115200},
+        **({"console": {"tty": tty, "baud": 115200}} if tty else {}),
         "ports": {port: {"tty": tty} for port, tty in ports.items()},
         "network_interface": "eth0",
         "disk_modules": disks,
         "modules": _isa_watchdogs(found),
-        "qemu": _qemu(architecture, firmware, ports, int(found["memory_kib"][0])),
+        "qemu": _qemu(architecture, firmware, ports, bool(tty), int(found["memory_kib"][0])),
         "acceptance": {
             "memory_mib": int(found["memory_kib"][0]) * 97 // 100 // 1024,
             "clock_source": found["clock"][0],
@@ -183,9 +183,7 @@ def _ports(found: Mapping[str, Sequence[str]]) -> tuple[dict[str, str], list[str
         port = _LEGACY_IO.get(io, f"COM{int(number) + 1}")
         ports[port if port not in ports else f"PORT{number}"] = f"ttyS{number}"
         notes.append(f"Port ttyS{number}: {kind.removeprefix('uart:')} at {io.lstrip('0')}")
-    if not ports:
-        return {"COM1": "ttyS0", "COM2": "ttyS1"}, ["No serial port was found: the robot is reached by SSH alone."]
-    return ports, notes
+    return ports, notes or ["No serial port was found: the monitor shows the boot, and login is by SSH only."]
 
 
 def _disk_modules(found: Mapping[str, Sequence[str]]) -> list[str]:
@@ -216,8 +214,10 @@ _ISA_WATCHDOGS = {
 """Drivers of Linux's drivers/watchdog that no bus announces."""
 
 
-def _qemu(architecture: str, firmware: str, ports: Mapping[str, str], memory_kib: int) -> dict[str, object]:
-    """A computer of the same kind, with as many serial ports as a PC has."""
+def _qemu(
+    architecture: str, firmware: str, ports: Mapping[str, str], console: bool, memory_kib: int
+) -> dict[str, object]:
+    """A computer of the same kind, with as many serial ports as a PC has. `console`: the first port is the console."""
     count = min(len(ports), _QEMU_PORTS)
     return {
         "system": {"amd64": "x86_64", "i386": "i386"}[architecture],
@@ -226,5 +226,5 @@ def _qemu(architecture: str, firmware: str, ports: Mapping[str, str], memory_kib
         "memory_mib": max(64, min(512, memory_kib // 1024)),
         "disk": _QEMU[firmware]["disk"],
         "network": _QEMU[firmware]["network"],
-        "devices": [f"isa-serial,index={number},chardev=port{number}" for number in range(1, count)],
+        "devices": [f"isa-serial,index={number},chardev=port{number}" for number in range(1 if console else 0, count)],
     }

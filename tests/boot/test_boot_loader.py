@@ -356,6 +356,19 @@ def test_a_kernel_without_an_initramfs(board: Board, stubbed: StubCard, toolset:
                 assert started.slot == order[0]
 
 
+def test_without_a_console_grub_writes_nothing_to_a_serial_port(
+    board: Board, loader: BootLoader, stubbed: StubCard, toolset: Tools, tmp_path: Path
+) -> None:
+    """The computer has the port, and the stub writes to it."""
+    assert CLEARED in check(loader, "as made", {}).said
+    none = board.model_copy(update={"console": None})
+    head = stubbed.with_core(card.grub_core(none, toolset, tmp_path, card.grub_config(none)))
+    with BootLoader(board, stubbed, tmp_path / "none", head=head) as silent:
+        started = silent.start({})
+    assert started.slot == "A"
+    assert CLEARED not in started.said
+
+
 def test_the_watchdog_runs_before_the_kernel_does(
     board: Board, loader: BootLoader, stubbed: StubCard, toolset: Tools, tmp_path: Path
 ) -> None:

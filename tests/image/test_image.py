@@ -370,6 +370,7 @@ def _header(image: Path) -> dict[str, str]:
 
 def test_kernel_command_line(robot_card: Card) -> None:
     words = _header(robot_card.image)["ARGUMENTS"].split()
+    assert robot_card.board.console
     console = f"console={robot_card.board.console.tty},{robot_card.board.console.baud}n8"
     expected = {*robot_card.board.kernel_arguments, "ro", "panic=1", "sysctl.kernel.sysrq=0", console}
     assert expected <= set(words), f"slot A lacks {expected - set(words)}: {' '.join(words)}"

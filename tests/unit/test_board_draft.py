@@ -84,8 +84,11 @@ def test_a_pc104_computer() -> None:
 
 def test_a_computer_without_serial_ports() -> None:
     text = board_draft.render(board_draft.read(NUC.replace("uart\t0", "other\t0")), "drafted")
-    assert "# No serial port was found: the robot is reached by SSH alone.\n" in text
-    assert yaml.safe_load(text)["board"]["console"]["tty"] == "ttyS0"
+    assert "# No serial port was found: the monitor shows the boot, and login is by SSH only.\n" in text
+    board = yaml.safe_load(text)["board"]
+    assert "console" not in board
+    assert (board["ports"], board["qemu"]["devices"]) == ({}, [])
+    assert "console" in drafted(NUC)
 
 
 @pytest.mark.parametrize("answer", [NUC, PC104], ids=["uefi", "bios"])

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 from ipaddress import IPv4Address, IPv4Network
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Network, Robot
-from flotilla.lab.qemu import boot, qemu
+from flotilla.lab.qemu import boot, qemu, saved
 from flotilla.robot import ssh
 
 ROBOT = Robot(name="robot3", address=IPv4Address("10.42.0.3"), number=3, board="pc104")
@@ -235,6 +237,30 @@ def test_missing_qemu(qemu_installed: Path) -> None:
 def test_boot_without_image(build: Path) -> None:
     with pytest.raises(UserError, match=r"robot3.img is missing; build it: make image ROBOT=3"):
         boot.boot(ROBOT, board(), NETWORK, build / "robot3.img")
+
+
+def test_boot_without_a_console_names_the_way_to_log_in(
+    build: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = build / "robot3.img"
+    image.touch()
+    monkeypatch.setattr(qemu, "make_overlay", lambda *_: None)
+    monkeypatch.setattr(subprocess, "run", lambda argv, **_: subprocess.CompletedProcess(argv, 0))
+    for console, shown in ((board().console, False), (None, True)):
+        boot.boot(ROBOT, board().model_copy(update={"console": console}), NETWORK, image)
+        assert ("has no `console:`" in capsys.readouterr().err) == shown
+
+
+@pytest.mark.parametrize("console", [True, False])
+def test_a_guest_without_a_console_has_booted_once_ssh_connects(console: bool) -> None:
+    """Seen to fail: `make fleet` waited for a login prompt that this guest does not have."""
+    waited = Mock()
+    waited.expect.return_value = ["", ROBOT.name]
+    booted = board(disk="nvme")  # of which nothing is saved
+    guest = Mock(restored=False, board=booted.model_copy(update={} if console else {"console": None}))
+    guest.console.expect = waited.expect
+    saved.wait(guest, ROBOT, Mock(connect=waited.connect))
+    assert [name for name, *_ in waited.mock_calls] == (["expect", "connect"] if console else ["connect"])
 
 
 def test_port_is_known_only_while_make_boot_runs(build: Path) -> None:

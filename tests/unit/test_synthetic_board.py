@@ -178,6 +178,27 @@ def test_its_card_boots_it(board: Board) -> None:
     assert [one.partuuid(board, 0xF1) for one in partitions] == [f"000000f1-0{number}" for number in (1, 2, 3, 4)]
 
 
+def test_without_a_serial_console_only_the_monitor_shows_its_boot(board: Board) -> None:
+    """Seen to fail: a board had to name a port, also where its computer has none."""
+    other = board.model_copy(update={"console": None})
+    serial = ("serial --unit=2 --speed=38400\n", "terminal_input serial console\n", "terminal_output serial console\n")
+    config = card.grub_config(board).decode()
+    for line in serial:
+        assert config.count(line) == 1
+        config = config.replace(line, "")
+    assert card.grub_config(other).decode() == config
+    assert [*card.kernel_arguments(other), "console=ttyS2,38400n8"] == card.kernel_arguments(board)
+    assert (board.console_tty, other.console_tty) == ("ttyS2", "")
+
+
+def test_a_board_may_have_no_console(own: Path) -> None:
+    """Seen to fail with `board.console: (missing): is missing`."""
+    file = own / "inventory/group_vars/board_vortex.yml"
+    for none in ("", "  console:\n"):
+        file.write_text(BOARD.replace("  console: { tty: ttyS2, baud: 38400 }\n", none))
+        assert inventory.load_fleet().boards[NAME].console is None
+
+
 def test_its_robot_gets_its_ports_and_modules(fleet: Fleet) -> None:
     files = {str(path): content.decode() for path, (content, _) in identity.render(fleet, fleet.robots[9]).items()}
     assert files["/etc/modules-load.d/board.conf"].splitlines()[-1] == "w83627hf_wdt"
@@ -200,6 +221,20 @@ def test_its_machine_in_qemu(board: Board, tmp_path: Path, monkeypatch: pytest.M
     assert "-serial none -serial none -serial chardev:console" in said
     assert "-chardev null,id=port0 -chardev null,id=port1 -chardev null,id=port3 " in said
     assert [argv[at + 1] for at, word in enumerate(argv) if word == "-device"][2:] == board.qemu.devices
+
+
+def test_its_machine_without_a_console(board: Board, own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each port is a device of the board's; nothing reads the console's backend."""
+    monkeypatch.setattr(qemu, "find_tool", lambda name: name)
+    other = board.model_copy(update={"console": None})
+    argv = qemu.command_line(other, own / "card", qemu.Options())
+    assert "-serial" not in argv
+    assert " ".join(f"-chardev null,id=port{index}" for index in range(4)) in " ".join(argv)
+    emulator = machine.Emulator(lock.read_lock("emulator"), own)
+    measured = machine.Machine(emulator, other, own, own, ())
+    assert "-serial" not in measured.command_line(own / "console", own / "results")
+    assert subject.tested_ports(other)["uart_own"] == "COM2"
+    assert b"TTYPath=/dev/console\n" in subject.units(other, subject.DIRECTORY)["latency.service"]
 
 
 def test_latency_measures_it(own: Path, board: Board) -> None:

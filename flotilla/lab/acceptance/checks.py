@@ -156,7 +156,7 @@ def _serial(asked: Asked) -> Iterator[Outcome]:
     for name, fact in asked.facts.parts["serial"].items():
         tty = asked.board.ports[name].tty
         what = f"{name} ({tty})"
-        if fact.get("users") or tty == asked.board.console.tty:
+        if fact.get("users") or tty == asked.board.console_tty:
             users = ", ".join(fact.get("users", ())) or "the console"
             yield Outcome(part="serial", what=what, state="not judged", found=f"in use by {users}")
             continue

@@ -106,7 +106,7 @@ def _parts(
     asked = {
         "parts": parts,
         "ports": {name: port.tty for name, port in board.ports.items()},
-        "console": board.console.tty,
+        "console": board.console_tty,
         "interface": fleet.interface(robot),
         "can": sorted(robot.can),
         "seconds": seconds,

@@ -120,8 +120,7 @@ class Machine:
         if self.disk:
             drive = {"driver": "raw", "node-name": "disk", "file": {"driver": "file", "filename": str(self.disk)}}
             argv += ["-blockdev", json.dumps(drive), "-device", "ide-hd,drive=disk,bus=ide.0,unit=0"]
-        argv += ["-chardev", qemu.chardev("console", _file(console)), *["-serial", "none"] * int(board.console.tty[4:])]
-        argv += ["-serial", "chardev:console"]
+        argv += qemu.console(board, _file(console))
         for name, identifier in qemu.port_ids(board).items():
             end = _file(results) if name == results_port(board, modules=self.modules) else qemu.NULL
             argv += ["-chardev", qemu.chardev(identifier, end)]

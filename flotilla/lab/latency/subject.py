@@ -121,7 +121,7 @@ def measurement(board: Board, plan: dict[str, Any]) -> dict[str, tuple[int, byte
 
 def units(board: Board, directory: PurePosixPath, *, modules: bool = True) -> dict[str, bytes]:
     """The measurement's units and the drop-ins that start them, by their names below `systemd/system`."""
-    tty, console = board.ports[machine.results_port(board, modules=modules)].tty, board.console.tty
+    tty, console = board.ports[machine.results_port(board, modules=modules)].tty, board.console_tty or "console"
     files = {}
     for name, (text, target) in UNITS.items():
         files[f"{name}.service"] = text.format(directory=directory, tty=tty, console=console).encode()
@@ -207,7 +207,7 @@ def tested_ports(board: Board) -> dict[str, str]:
     The first two ports have interrupts of their own, and one of them may be the console; those after the fourth share
     one. A board may lack either.
     """
-    own = "ttyS0" if board.console.tty == "ttyS1" else "ttyS1"
+    own = "ttyS0" if board.console_tty == "ttyS1" else "ttyS1"
     named = {port.tty: name for name, port in board.ports.items()}
     return {name: named[tty] for name, tty in {"uart_own": own, "uart_shared": "ttyS4"}.items() if tty in named}
 

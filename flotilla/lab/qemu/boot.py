@@ -47,6 +47,8 @@ def boot(robot: Robot, board: Board, network: Network, image: Path, station: IPv
             f"{robot.name}: booting {paths.shown(image)} ({board.description}); what it writes is thrown away\n"
             f"leave: Ctrl-A X    QEMU's monitor and back: Ctrl-A C    shell: make ssh ROBOT={robot.number}\n"
         )
+        if not board.console:
+            sys.stderr.write(f"board {board.name} has no `console:`: the boot is not shown here; use `make ssh`\n")
         sys.stderr.flush()
         try:
             status = subprocess.run(argv, check=False).returncode

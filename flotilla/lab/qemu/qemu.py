@@ -146,9 +146,7 @@ def command_line(board: Board, card: Path, options: Options) -> list[str]:
     argv += _card(board, card, options)
     # The network card precedes the board's devices: slots are dealt in this order, so its address never moves.
     argv += _network(board, options)
-    # `-serial` counts from COM1; the ports around the console's are the board's devices.
-    argv += ["-chardev", chardev("console", options.console), *["-serial", "none"] * int(board.console.tty[4:])]
-    argv += ["-serial", "chardev:console"]
+    argv += console(board, options.console)
     if unknown := options.ports.keys() - set(port_ids(board)):
         raise ValueError(f"board {board.name} has no port {', '.join(sorted(unknown))} besides the console")
     for port, identifier in port_ids(board).items():
@@ -212,6 +210,17 @@ def make_overlay(image: Path, overlay: Path, size: int = 0, below: Literal["raw"
     overlay.chmod(0o600)  # what the guest writes may be a private key
 
 
+def console(board: Board, backend: str) -> list[str]:
+    """Arguments of the console's backend, and of the serial port that uses it if the board has a console.
+
+    `-serial` counts from COM1; the ports around the console's are the board's devices.
+    """
+    argv = ["-chardev", chardev("console", backend)]
+    if not board.console:
+        return argv
+    return [*argv, *["-serial", "none"] * int(board.console.tty[4:]), "-serial", "chardev:console"]
+
+
 def chardev(identifier: str, backend: str) -> str:
     """Argument of `-chardev`."""
     kind, comma, rest = backend.partition(",")
@@ -221,7 +230,7 @@ def chardev(identifier: str, backend: str) -> str:
 def port_ids(board: Board) -> dict[str, str]:
     """Chardev ids of the board's serial ports: `port0` its first, and so on; the console's is called otherwise."""
     return {
-        name: f"port{index}" for index, (name, port) in enumerate(board.ports.items()) if port.tty != board.console.tty
+        name: f"port{index}" for index, (name, port) in enumerate(board.ports.items()) if port.tty != board.console_tty
     }
 
 

@@ -46,8 +46,9 @@ def wait(guest: Guest, robot: Robot, shell: Ssh) -> None:
     if guest.restored:
         shell.script("date --set=@$(cat /sys/class/rtc/rtc0/since_epoch)")
         return
-    await_login(guest, robot)
-    shell.connect()
+    if guest.board.console:
+        await_login(guest, robot)
+    shell.connect(BOOT_SECONDS)
     shell.script("systemctl is-system-running --wait", check=False)
     if guest.board.qemu.disk not in qemu.NEVER_SAVED and not cache.has(_KIND, key := _key(guest)):
         shell.hang_up()  # its connection would be a restored guest's too

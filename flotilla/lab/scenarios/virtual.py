@@ -131,7 +131,7 @@ def fleet(
 
 def _moved(described: Fleet, board: Board) -> Fleet:
     """The same robots, as computers of another kind."""
-    free = [name for name, port in board.ports.items() if port.tty != board.console.tty]
+    free = [name for name, port in board.ports.items() if port.tty != board.console_tty]
     for robot in described.robots.values():
         for name, device in robot.devices.items():
             if device.port not in free:

@@ -34,7 +34,7 @@ def test_interrupt_threads_have_their_priorities(robot: RobotGuest, board: Board
         name, policy, priority = line.rsplit(maxsplit=2)
         wanted = [value for pattern, value in rules if fnmatch.fnmatchcase(name, pattern)]
         # The console's thread comes and goes with the log-in prompt, and nothing urgent hangs on it.
-        if not wanted or name.endswith(f"-{board.console.tty}"):
+        if not wanted or name.endswith(f"-{board.console_tty}"):
             continue
         checked.add(name)
         if (policy, priority) != ("FF", wanted[-1]):
