@@ -19,7 +19,7 @@ far, with that of flotilla-patch). Whatever is cut off, by power or by the
 radio, begins again with `begin`, and goes on where it was. Status 1: refused, with the reason on standard error.
 
 The header is cleared before anything else of the slot is written, and written when all of it is on the card
-(images/builder/slot.py). Reads and writes go past the page cache, which belongs to the control tasks. What this module
+(flotilla/images/slot.py). Reads and writes go past the page cache, which belongs to the control tasks. What this module
 imports counts as memory on a robot, of which an update may take 16 MB (docs/decisions/0055-updater-within-16-mb.md).
 """
 
@@ -54,6 +54,7 @@ SECTOR = 512
 LARGEST_CHUNK = 1 << 18
 ORPHANS = 10
 """Stratum of a clock that no station leads (/etc/chrony/chrony.conf)."""
+_ANY_DIGIT = dict.fromkeys(range(ord("1"), ord("9") + 1), "0")
 SIGKILL = 9  # without `signal`, which takes a quarter of a MB
 
 
@@ -193,7 +194,9 @@ class Release:
         if not self.running:
             check_number(number, present, accept_old)
         self.number, self.accepted = number, number == accept_old
-        self.expires = str(manifest.get("expires", ""))  # none in bundles of earlier versions
+        self.expires: str = manifest.get("expires", "")  # none in bundles of earlier versions
+        if "expires" in manifest and not is_day(self.expires):  # which is compared as text
+            raise Refused(f"expires of the manifest is {self.expires!r}, and no day such as 2027-01-31")
         self.unchecked = ""
         self.chunk_bytes: int = manifest["chunk_bytes"]
         self.chunks: list[str] = manifest["chunks"]
@@ -258,6 +261,11 @@ class Release:
             "chunk_bytes": self.chunk_bytes,
             "unchecked": self.unchecked,
         }
+
+
+def is_day(value: object) -> bool:
+    """Whether it is a date by ISO 8601. A month or day may be out of range, since dates are compared as text."""
+    return isinstance(value, str) and value.translate(_ANY_DIGIT) == "0000-00-00"
 
 
 def check_number(number: int, present: dict[str, str], accept_old: int | None) -> None:
