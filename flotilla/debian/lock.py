@@ -30,6 +30,8 @@ _COMPONENTS = "main non-free-firmware"
 _KEYRINGS = tuple(Path("/usr/share/keyrings", f"debian-archive-keyring.{suffix}") for suffix in ("gpg", "pgp"))
 _DATE = "%Y-%m-%dT%H:%M:%SZ"
 
+FLEET = "fleet"
+"""The list of a fleet's home whose packages all its robots have besides."""
 HOST = System("amd64", "trixie")
 """What programs of the runtime are compiled for that this computer runs, where no board says otherwise."""
 
@@ -75,7 +77,7 @@ def recipes(boards: Iterable[Board]) -> dict[str, Recipe]:
     file = yaml_file.read(path, File)
     found: dict[str, Recipe] = {}
     for board in boards:
-        found[board.name] = Recipe(board.suite, board.architecture, ("robot", f"robot-{board.suite}", board.name))
+        found[board.name] = _of_board(board)
     for name, asked in file.locks.items():
         if name in found:
             raise UserError(f"{paths.shown(path)}: locks.{name}: is a board's name, too; give one of them another")
@@ -83,6 +85,11 @@ def recipes(boards: Iterable[Board]) -> dict[str, Recipe]:
     for system in sorted({HOST, *(board.system for board in boards)}):
         found[runtime_lock(system)] = Recipe(system.suite, system.architecture, ("runtime",), system=False)
     return found
+
+
+def _of_board(board: Board) -> Recipe:
+    of_fleet = [FLEET] if sources.find(paths.PACKAGES, f"{FLEET}.list").is_file() else []
+    return Recipe(board.suite, board.architecture, ("robot", f"robot-{board.suite}", *of_fleet, board.name))
 
 
 def runtime_lock(system: System) -> str:
@@ -221,6 +228,14 @@ def board_lock(board: Board) -> Lock:
             f"{paths.shown(lock_file(board.name))}: architecture: {lock.architecture}: the board's is "
             f"{board.architecture}; run `make lock ONLY={board.name}`"
         )
+    locked = {package.name for package in lock.packages}
+    for each in _of_board(board).lists:  # the lock of a kernel has the package that this one depends on
+        asked = [request.package for request in read_list(each) if not request.kernel]
+        if missing := [package for package in asked if package not in locked]:
+            raise UserError(
+                f"{paths.shown(sources.find(paths.PACKAGES, f'{each}.list'))}: {', '.join(missing)}: not in "
+                f"{paths.shown(lock_file(board.name))} yet; run `make lock ONLY={board.name}`"
+            )
     return lock
 
 

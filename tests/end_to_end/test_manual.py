@@ -66,6 +66,17 @@ ELSEWHERE = {
     "build/venv/bin/python -m serial.tools.miniterm /dev/ttyUSB0 115200": "needs a cable",
     "sudo ip address add 10.42.0.254/24 dev eth0": "changes this computer's network",
     "ping 10.42.0.3": "needs the robot",
+    **dict.fromkeys(
+        (
+            "make wheel",
+            "python3 -m venv ~/flotilla",
+            '~/flotilla/bin/pip install -c constraints.txt "flotilla[station] @ file://$PWD/flotilla-0.1.0-py3-none-any.whl"',
+            "~/flotilla/bin/flotilla init rovers",
+            "cd rovers",
+            "~/flotilla/bin/flotilla image 1",
+        ),
+        "is for another computer; image/test_package.py does the same",
+    ),
     "make hwcheck ROBOT=3": "needs the robot; tests/boot/shared asks guests the same",
     **dict.fromkeys(
         ("make hwcheck TARGET=ssh:root@192.168.1.20 NAME=nuc7", "ssh root@192.168.1.20 'dmesg | grep -i firmware'"),
@@ -77,8 +88,7 @@ ELSEWHERE = {
             "cp images/packages/pc_uefi.list ../rovers/packages/nuc7.list",
             "echo 'firmware-realtek # Ethernet at full speed' >>../rovers/packages/nuc7.list",
             "make lock ONLY=nuc7 FLEET=../rovers",
-            "cp images/packages/pc_uefi.list ../rovers/packages/",
-            "echo 'htop # shows which process needs the processor' >>../rovers/packages/pc_uefi.list",
+            "echo 'htop # shows which process needs the processor' >>../rovers/packages/fleet.list",
             "make lock ONLY=pc_uefi FLEET=../rovers",
             "make boot ROBOT=1 FLEET=../rovers",
         ),

@@ -13,6 +13,7 @@ import yaml
 
 import flotilla.__main__ as program
 from flotilla.common import paths, sources
+from flotilla.common.errors import UserError
 from flotilla.debian import kernel, lock
 from flotilla.debian.lock import board_lock, read_lock
 from flotilla.fleet import home, identity
@@ -192,6 +193,24 @@ def test_the_home_has_locks_lists_and_kernels_of_its_own(at_home: Path) -> None:
     assert lock.own_lock_file("tools") == at_home / "locks/tools.lock"
     shutil.copyfile(paths.KERNELS / "x86_64.yml", at_home / "kernel/rover.yml")
     assert {"rover", BOARD} <= {*kernel.names()}
+
+
+def test_a_package_of_the_fleet_is_in_the_lock_of_each_board(at_home: Path, fleet: Fleet) -> None:
+    """Seen to fail: a list with a further line changed nothing, and `make image` gave no reason."""
+    board = fleet.boards[BOARD]
+    tools = lock.board_lock(board)
+    (at_home / "packages").mkdir()
+    (at_home / "packages/fleet.list").write_text("htop # shows processes\n")
+    recipe = lock.recipes([board])[BOARD]
+    asked = {each.package for each in lock.requests(recipe) if not each.kernel}
+    assert asked - {each.name for each in tools.packages} == {"htop"}
+    remedy = f"fleet.list: htop: not in .*{BOARD}.lock yet; run `make lock ONLY={BOARD}`"
+    with pytest.raises(UserError, match=remedy):
+        lock.board_lock(board)
+    (at_home / "locks").mkdir()
+    line = "package htop 3.2.2-2 amd64 userland debian 1 " + 64 * "0" + " pool/main/h/htop/htop_3.2.2-2_amd64.deb\n"
+    (at_home / f"locks/{BOARD}.lock").write_text((paths.LOCKS / f"{BOARD}.lock").read_text() + line)
+    assert len(lock.board_lock(board).packages) == len(tools.packages) + 1
 
 
 def test_a_board_of_the_home(fleet_home: Path) -> None:
