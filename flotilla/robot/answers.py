@@ -27,29 +27,31 @@ Sha256 = Annotated[str, pydantic.StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Count = Annotated[int, pydantic.Field(ge=0, le=2**63)]
 
 
-class _Answer(pydantic.BaseModel):
+class Answer(pydantic.BaseModel):
+    """Members that the station acts on; others are kept to be displayed."""
+
     model_config = pydantic.ConfigDict(extra="allow", strict=True, frozen=True)
 
 
-class Drift(_Answer):
+class Drift(Answer):
     path: Etc
     action: Literal["write", "remove", "restore"]
     why: Text
     before: Text
 
 
-class Lately(_Answer):
+class Lately(Answer):
     steps: Count
     overruns: Count
 
 
-class Sensor(_Answer):
+class Sensor(Answer):
     flag: bool
     age_s: float | None
     """None: it was never good, or that is no number."""
 
 
-class Status(_Answer):
+class Status(Answer):
     """Of a control task that says how it does."""
 
     steps: Count
@@ -58,20 +60,20 @@ class Status(_Answer):
     sensors: dict[Word, Sensor] = {}
 
 
-class Problem(_Answer):
+class Problem(Answer):
     """Of one that does not."""
 
     problem: Text
 
 
-class Task(_Answer):
+class Task(Answer):
     ActiveState: Word
     SubState: Word
     NRestarts: Word
     status: Problem | Status | None = None
 
 
-class App(_Answer):
+class App(Answer):
     version: Word | Literal[""]
     listed: Word | Literal[""]
     kept: bool
@@ -80,19 +82,19 @@ class App(_Answer):
     files: list[Text]
 
 
-class Slot(_Answer):
+class Slot(Answer):
     ok: bool
     blob: Text | None
     release: Text | None
     kernel: Text | None
 
 
-class Slots(_Answer):
+class Slots(Answer):
     A: Slot
     B: Slot
 
 
-class Release(_Answer):
+class Release(Answer):
     """What `flotilla-slot show` says."""
 
     running: Literal["A", "B"] | None
@@ -100,7 +102,7 @@ class Release(_Answer):
     slots: Slots
 
 
-class State(_Answer):
+class State(Answer):
     """What `ansible/library/robot_state.py` finds."""
 
     drift: list[Drift]
@@ -121,7 +123,7 @@ class State(_Answer):
     data_free_bytes: Count
 
 
-class Told(_Answer):
+class Told(Answer):
     """What `/usr/lib/flotilla/update.py` says of a release."""
 
     missing: list[Count]
@@ -134,7 +136,7 @@ class Told(_Answer):
     """Why the expiry was not checked; empty if it was, or if the robot or the bundle has none."""
 
 
-_Model = TypeVar("_Model", bound=_Answer)
+_Model = TypeVar("_Model", bound=Answer)
 
 
 def judged(robot: str, answer: object, model: type[_Model]) -> dict[str, Any]:

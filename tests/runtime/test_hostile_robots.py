@@ -27,7 +27,6 @@ from flotilla.common import ansible, paths
 from flotilla.fleet import identity, inventory
 from flotilla.lab.containers import scale
 from tests.figures import PROPERTY
-from tests.runtime.test_update import CHUNK, header_of, manifest_of, pack
 from tests.station import on_loopback
 
 SECONDS = 600
@@ -304,6 +303,9 @@ def calls(playbook: str, names: list[str], tmp_path: Path) -> list[list[str]]:
         alone = [[*bound, "-e", f"replaced={robot}", "-l", f"localhost,{robot}"] for robot in silent]
         return [[*bound, "-e", "replaced=robot1"], *alone]
     if playbook == "update":
+        # Here, because it needs the example fleet, which commands of this module's process do not have.
+        from tests.runtime.test_update import CHUNK, header_of, manifest_of, pack
+
         blob = bytes(8 * CHUNK)
         file = pack(tmp_path / "small.bundle", manifest_of(blob, header_of(blob)), [], blob)
         return [[*bound, "-e", f"bundle={file}", "-e", "settle_s=0", *words] for words in ([], ["-e", "go=back"])]
@@ -311,9 +313,11 @@ def calls(playbook: str, names: list[str], tmp_path: Path) -> list[list[str]]:
 
 
 COMMANDS = {
+    "accept": ["3", "--plan", "none", "--seconds", "1"],
     "deploy": ["3", "examples/saw-tooth", "--run", "status"],
     "fetch": ["3", "control"],
     "hwcheck": ["3", "--seconds", "1"],
+    "latency": ["--target", "ssh:robot3"],
     "param": ["3", "control"],
     "releases": ["3"],
     "scope": ["3", "control", "gyro.rate"],

@@ -7,6 +7,7 @@ import copy
 import html
 import io
 import json
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,7 +21,7 @@ from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet import keys
 from flotilla.fleet.model import Fleet, Robot
-from flotilla.lab.acceptance import checks, command, facts, outcome, relays, report
+from flotilla.lab.acceptance import answers, checks, command, facts, outcome, relays, report
 from flotilla.lab.acceptance.facts import Facts
 from flotilla.lab.acceptance.outcome import Acceptance
 from flotilla.lab.acceptance.relays import Relay
@@ -103,6 +104,63 @@ def test_each_fault_is_named(
     change(found, value)
     (fault,) = failures(fleet, robot, found)
     assert fault.startswith(said)
+
+
+WRONG = (None, True, -1, 1e400, "x" * (1 << 18), "\x1b[2J", [1], {"x": 1})
+"""In place of each member of an answer."""
+
+
+def _members(value: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    yield path
+    for key, each in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        yield from _members(each, (*path, key))
+
+
+def _changed(value: Any, path: tuple[str | int, ...], new: object) -> Any:
+    if not path:
+        return new
+    value = copy.deepcopy(value)
+    at = value
+    for key in path[:-1]:
+        at = at[key]
+    at[path[-1]] = new
+    return value
+
+
+@pytest.mark.parametrize("part", ANSWERED["parts"])
+def test_a_robot_in_other_hands_is_judged_or_rejected(fleet: Fleet, robot: Robot, part: str) -> None:
+    """Each member is another one, or missing. Seen to fail: an answer without `part` ended in a traceback."""
+    reasons, judged = [], 0
+    ports = fleet.boards[robot.board].ports
+    for path in _members(ANSWERED["parts"][part]):
+        for new in WRONG:
+            line = json.loads(json.dumps({"part": part, "facts": _changed(ANSWERED["parts"][part], path, new)}))
+            whole = answered()
+            try:
+                found = answers.part(robot.name, line, ports)
+                whole.parts[part] = found["facts"]
+            except UserError as error:
+                reasons.append(str(error))
+                continue
+            if part == "network":
+                whole = replace(whole, link=(found["facts"], found["facts"]))
+            made = checks.judge(fleet, robot, whole, "none")
+            assert "\x1b" not in command.said(made)
+            assert not [value for value in made.figures.values() if not math.isfinite(value)]
+            judged += 1
+    assert judged
+    assert len(reasons) > len(WRONG) // 2
+    assert not [reason for reason in reasons if not reason.startswith("robot3: ") or "\x1b" in reason]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "hello", "[]", "1", "null", "{}", '{"part": 1}', '{"part": "x", "facts": {}}', "[" * 100_000, "\x00"]
+)
+def test_what_is_no_answer_is_rejected(robot: Robot, text: str) -> None:
+    with pytest.raises(UserError, match=r"^robot3: "):
+        [answers.part(robot.name, line, ()) for line in answers.lines(robot.name, io.StringIO(text + "\n"))]
+    with pytest.raises(UserError, match=r"^robot3: "):
+        answers.state(robot.name, text)
 
 
 def test_a_console_that_nobody_uses_is_not_judged(fleet: Fleet, robot: Robot) -> None:

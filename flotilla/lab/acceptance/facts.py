@@ -14,7 +14,7 @@ from flotilla.apps import assigned
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Board, Fleet, Robot
-from flotilla.lab.acceptance import on_robot, relays
+from flotilla.lab.acceptance import answers, on_robot, relays
 from flotilla.lab.acceptance.relays import Relay
 from flotilla.lab.latency import results, target
 from flotilla.lab.latency.results import Results
@@ -73,13 +73,13 @@ def ask(
     with progress.step(f"{robot.name}: {progress.size(_SENT_BYTES)} each way over its link"):
         shell.write("/dev/null", bytes(_SENT_BYTES))
         shell.run(["head", "-c", str(_SENT_BYTES), "/dev/zero"])
-    answers = _parts(shell, board, fleet, robot, list(on_robot.PARTS), seconds)
+    said = _parts(shell, board, fleet, robot, list(on_robot.PARTS), seconds)
     return Facts(
-        parts={name: said["facts"] for name, said in answers.items() if "facts" in said},
-        errors={name: said["error"] for name, said in answers.items() if "error" in said},
+        parts={name: each["facts"] for name, each in said.items() if "facts" in each},
+        errors={name: each["error"] for name, each in said.items() if "error" in each},
         state=described,
         release=release.wanted(robot),
-        link=(before["network"].get("facts"), answers["network"].get("facts")),
+        link=(before["network"].get("facts"), said["network"].get("facts")),
         latency=target.measure(robot, board, shell, plan, out) if plan else None,
         relays=watched,
         bite_s=_bitten(robot, shell) if bite else None,
@@ -92,11 +92,7 @@ def _described(fleet: Fleet, robot: Robot, shell: Ssh, inventory: Path) -> dict[
     arguments = json.dumps(state.arguments(inventory, fleet, robot, built, fleet.health))
     source = _STATE.read_text().replace(_STATE_ARGUMENTS, arguments)
     with progress.step(f"{robot.name} beside its description"):
-        said: dict[str, Any] = json.loads(shell.run(["sudo", "python3", "-"], stdin=source).stdout)
-    if "state" not in said:
-        raise UserError(f"{robot.name}: cannot be compared with its description: {said.get('msg', said)}")
-    found: dict[str, Any] = said["state"]
-    return found
+        return answers.state(robot.name, shell.run(["sudo", "python3", "-"], stdin=source).stdout)
 
 
 def _parts(
@@ -113,21 +109,21 @@ def _parts(
     }
     found: dict[str, dict[str, Any]] = {}
     with progress.step(f"{robot.name}: its computer", lambda: progress.Far(len(found), len(parts), "parts")):
-        for said in _lines(shell, asked):
+        for line in _lines(robot, shell, asked):
+            said = answers.part(robot.name, line, board.ports)
             found[said["part"]] = said
     if missing := [name for name in parts if name not in found]:
         raise UserError(f"{robot.name} stopped answering at {missing[0]}; is it on? `make ssh ROBOT={robot.number}`")
     return found
 
 
-def _lines(shell: Ssh, asked: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _lines(robot: Robot, shell: Ssh, asked: dict[str, Any]) -> Iterator[Any]:
     with shell.start(["sudo", "python3", "-", json.dumps(asked)]) as program:
         assert program.stdin
         assert program.stdout
         program.stdin.write((_HERE / "on_robot.py").read_text())
         program.stdin.close()
-        for line in program.stdout:
-            yield json.loads(line)
+        yield from answers.lines(robot.name, program.stdout)
 
 
 def _bitten(robot: Robot, shell: Ssh) -> float:

@@ -6,7 +6,6 @@ their reset state however it ends.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,9 @@ import yaml
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.fleet.model import Robot
+from flotilla.lab.acceptance import answers
 from flotilla.lab.qemu.ssh import Ssh
+from flotilla.robot.answers import judged
 
 _TYPE = "ir104-pbf"
 _FILE = "/run/accept-relay.yml"
@@ -68,7 +69,7 @@ def watch(robot: Robot, shell: Ssh, person: Callable[[str], bool]) -> list[Relay
         raise UserError(f"{robot.name} has no control task with a block {_TYPE}: leave out RELAYS=1")
     with _stopped(shell, robot.control_tasks):
         return [
-            Relay(board, number, *_switched(shell, board, number, person))
+            Relay(board, number, *_switched(robot.name, shell, board, number, person))
             for board in described
             for number in board.channels
         ]
@@ -84,7 +85,7 @@ def _stopped(shell: Ssh, tasks: Sequence[str]) -> Iterator[None]:
         shell.run(["sudo", "systemctl", "start", *units])
 
 
-def _switched(shell: Ssh, board: Board, number: int, person: Callable[[str], bool]) -> tuple[bool, bool]:
+def _switched(robot: str, shell: Ssh, board: Board, number: int, person: Callable[[str], bool]) -> tuple[bool, bool]:
     """Whether the person saw it, and whether it read back as another."""
     block = {
         "type": _TYPE,
@@ -97,14 +98,14 @@ def _switched(shell: Ssh, board: Board, number: int, person: Callable[[str], boo
     try:
         with shell.start(argv) as program:
             assert program.stdout
-            first = program.stdout.readline()
-            if not first:
+            lines = answers.lines(robot, program.stdout)
+            if (first := next(lines, None)) is None:
                 raise UserError(f"{board.task}: relay {number} cannot be switched; `make hwcheck` shows its I/O ports")
             try:
                 seen = person(f"{board.task}: is relay {number} on, and no other?")
             finally:
                 shell.run(["sudo", "pkill", "-TERM", "-f", f"^flotilla-run.*{_FILE}"], check=False)
-            said = [json.loads(line) for line in (first, *program.stdout)]
+            said = [judged(robot, line, answers.Watched) for line in (first, *lines)]
     finally:
         shell.run(["sudo", "rm", "-f", _FILE])
     return seen, any(line["relay.mismatch"] for line in said)
