@@ -163,7 +163,7 @@ def part(robot: str, line: object, ports: Collection[str]) -> dict[str, Any]:
     found = judged(robot, line, _Part)
     name = found["part"]
     if name not in FACTS:
-        raise UserError(f"{robot}: it answered for {name[:40]!r}, which no part of the test is; flash its card")
+        raise UserError(f"{robot}: it answered for {name[:40]!r}, which is no part of the test; flash its card")
     if "error" in found:
         return {"part": name, "error": judged(robot, found, _Failed)["error"]}
     facts = judged(robot, found, pydantic.create_model("Facts", __base__=Answer, facts=(FACTS[name], ...)))["facts"]
@@ -181,7 +181,7 @@ def state(robot: str, text: str) -> dict[str, Any]:
 
 
 def lines(robot: str, stream: IO[str]) -> Iterator[Any]:
-    """The JSON of each line; UserError for a line that has none, and for more than a robot has to say."""
+    """The JSON of each line; UserError for a line without JSON, and for too many lines."""
     for _ in range(_LINES):
         if not (text := stream.readline(_LINE)):
             return
