@@ -313,17 +313,15 @@ def calls(playbook: str, names: list[str], tmp_path: Path) -> list[list[str]]:
 
 
 COMMANDS = {
-    "accept": ["3", "--plan", "none", "--seconds", "1"],
     "deploy": ["3", "examples/saw-tooth", "--run", "status"],
     "fetch": ["3", "control"],
     "hwcheck": ["3", "--seconds", "1"],
-    "latency": ["--target", "ssh:robot3"],
     "param": ["3", "control"],
     "releases": ["3"],
     "scope": ["3", "control", "gyro.rate"],
 }
 """Those that read a robot's answer and end. `ssh` hands the terminal to the robot; tests/unit/test_services.py has the
-answers to `station` and `top`."""
+answers to `station` and `top`, tests/unit/test_acceptance.py those to `accept`."""
 
 
 @pytest.mark.nightly  # a process for each answer
