@@ -101,7 +101,7 @@ def prose(file: str, text: str) -> list[Piece]:
         spans = _of_source(_C, text, tests)
     elif name.endswith(".m"):
         spans = _comments(_PERCENT, text)
-    elif name == "Makefile":
+    elif name == "Makefile" or name.endswith(".mk"):
         spans = [*_groups(_HELP, text), *_comments(_MAKE, text)]
     elif name.endswith((".yml", ".yaml")):
         spans = [*_comments(_HASH, text), *_groups(_YAML_TEXT, text)]

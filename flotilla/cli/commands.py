@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flotilla.cli.command import Command, robot_argument
+from flotilla.cli.command import Command, Target, robot_argument
+from flotilla.common.variables import variable
 
 if TYPE_CHECKING:
     from datetime import date
@@ -16,29 +17,24 @@ if TYPE_CHECKING:
 
 def _image(arguments: argparse.Namespace) -> None:
     from flotilla.apps import assigned
-    from flotilla.common.errors import UserError
     from flotilla.fleet import inventory
     from flotilla.images import build
 
-    if arguments.all == (arguments.robot is not None):
-        raise UserError("say which: a robot's number, or --all")
     fleet = inventory.load_fleet()
     robots = list(fleet.robots.values()) if arguments.all else [inventory.robot(fleet, arguments.robot)]
     build.build(fleet, robots, apps=assigned.built(fleet, robots))
 
 
 def _image_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("robot", type=int, nargs="?", help="number in the inventory")
-    parser.add_argument("--all", action="store_true", help="every robot of the fleet")
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("robot", type=int, nargs="?", help="number in the inventory")
+    which.add_argument("--all", action="store_true", help="every robot of the fleet")
 
 
 def _flash(arguments: argparse.Namespace) -> None:
-    from flotilla.common.errors import UserError
     from flotilla.fleet import inventory
     from flotilla.images import build, flash
 
-    if (arguments.device is None) == (arguments.file is None):
-        raise UserError("say where to: the card's device, /dev/sdX, or --file FILE")
     robot = inventory.robot(inventory.load_fleet(), arguments.robot)
     flash.flash(
         build.image_of(robot), device=arguments.device, file=arguments.file, force=arguments.force, yes=arguments.yes,
@@ -48,10 +44,11 @@ def _flash(arguments: argparse.Namespace) -> None:
 
 def _flash_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
-    parser.add_argument("device", type=Path, nargs="?", help="the card: /dev/sdX")
-    parser.add_argument("--file", type=Path, help="a file instead of a card")
+    where = parser.add_mutually_exclusive_group(required=True)
+    variable(where.add_argument("device", type=Path, nargs="?", help="the card: /dev/sdX"), "DEV")
+    variable(where.add_argument("--file", type=Path, help="a file instead of a card"), "CARD")
     parser.add_argument("--force", help="the word that an earlier error named")
-    parser.add_argument("--yes", action="store_true", help="do not ask")
+    variable(parser.add_argument("--yes", action="store_true", help="do not ask"))
 
 
 def _kernel(arguments: argparse.Namespace) -> None:
@@ -77,7 +74,10 @@ def _verify(arguments: argparse.Namespace) -> None:
 
 def _verify_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
-    parser.add_argument("--plant", action="store_true", help="inject a difference, which the comparison must find")
+    plant = parser.add_argument(
+        "--plant", action="store_true", help="inject a difference, which the comparison must find"
+    )
+    variable(plant)
 
 
 def _verify_bundle(arguments: argparse.Namespace) -> None:
@@ -146,7 +146,10 @@ _day.__name__ = "YYYY-MM-DD"  # in argparse's errors
 
 def _bundle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("board", nargs="?", help="a board (the first robot's)")
-    parser.add_argument("--signature", type=Path, action="append", default=[], help="one that was made elsewhere")
+    signature = parser.add_argument(
+        "--signature", type=Path, action="append", default=[], help="one that was made elsewhere"
+    )
+    variable(signature, "SIGNATURES", words=True)
     parser.add_argument(
         "--expires", type=_day, metavar="DATE",
         help="last day on which robots accept the bundle: 2027-01-31 (`releases.lifetime_days` from today on)",
@@ -233,8 +236,13 @@ def _rotate_host_key(fleet: Fleet, robot: Robot, arguments: argparse.Namespace) 
 
 
 def _rotate_key_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("whose", type=_whose, help=f"a robot's number in the inventory, or {_OPERATOR}")
-    parser.add_argument("--retire", action="store_true", help="accept the old key no more")
+    whose = parser.add_argument("whose", type=_whose, help=f"a robot's number in the inventory, or {_OPERATOR}")
+    variable(whose, "ROBOT", "KEY")
+    parser.add_argument(
+        "--retire",
+        action="store_true",
+        help="accept the old key no more, once `make provision` has brought the new one",
+    )
     parser.add_argument("--force", action="store_true", help="retire the operator's, whichever robots still want it")
 
 
@@ -315,8 +323,17 @@ def _restore_keys(arguments: argparse.Namespace) -> None:
     print(f"{paths.shown(paths.KEYS)}: {files} files of {paths.shown(arguments.file)}")
 
 
-def _key_backup_arguments(parser: argparse.ArgumentParser) -> None:
+def _backup_keys_arguments(parser: argparse.ArgumentParser) -> None:
+    variable(parser.add_argument("file", type=Path, help="the encrypted file"), "OUT")
+    _password_argument(parser)
+
+
+def _restore_keys_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="the encrypted file")
+    _password_argument(parser)
+
+
+def _password_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--password-file", type=Path, metavar="FILE", help="has the passphrase; otherwise it is asked")
 
 
@@ -350,9 +367,7 @@ def _hwcheck(arguments: argparse.Namespace) -> None:
     from flotilla.fleet import inventory
     from flotilla.robot import board_draft, hwcheck
 
-    if (arguments.robot is None) == (arguments.target is None) or (arguments.target is None) != (
-        arguments.name is None
-    ):
+    if (arguments.target is None) != (arguments.name is None):
         raise UserError("hwcheck: give ROBOT=3 for a robot, or TARGET=ssh:USER@HOST NAME=nuc7 for any Debian computer")
     if arguments.target:
         print(board_draft.draft(arguments.target, arguments.name))
@@ -361,10 +376,11 @@ def _hwcheck(arguments: argparse.Namespace) -> None:
 
 
 def _hwcheck_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("robot", type=int, nargs="?", help="number in the inventory")
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("robot", type=int, nargs="?", help="number in the inventory")
+    which.add_argument("--target", metavar="ssh:USER@HOST", help="any Debian computer: draft the board's file from it")
     parser.add_argument("--seconds", type=int, default=60, help="to look for hardware latency (%(default)s)")
-    parser.add_argument("--target", metavar="ssh:USER@HOST", help="any Debian computer: draft the board's file from it")
-    parser.add_argument("--name", metavar="NAME", help="of the board to draft")
+    variable(parser.add_argument("--name", help="of the board to draft"), "NAME", only_with="TARGET")
 
 
 def _param(arguments: argparse.Namespace) -> None:
@@ -390,11 +406,14 @@ def _param(arguments: argparse.Namespace) -> None:
 def _param_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
     parser.add_argument("task", help="which runs on the robot")
-    parser.add_argument("parameter", nargs="?", help="block.parameter; all by default")
+    variable(parser.add_argument("parameter", nargs="?", help="block.parameter; all by default"), "PARAM")
     parser.add_argument(
         "--confirm", metavar="OLD", help="present value of a safety limit; without it the command asks you"
     )
-    parser.add_argument("value", nargs="?", help="new value; write a negative one after --")
+    value = parser.add_argument(
+        "value", nargs="?", help="new value; on the command line, write a negative one after --"
+    )
+    variable(value, "VALUE", only_with="PARAM")
 
 
 def _scope(arguments: argparse.Namespace) -> None:
@@ -415,7 +434,8 @@ def _scope(arguments: argparse.Namespace) -> None:
 def _scope_arguments(parser: argparse.ArgumentParser) -> None:
     robot_argument(parser)
     parser.add_argument("task", help="or app, which runs on the robot")
-    parser.add_argument("signal", nargs="*", help="block.port or block.port[2]; without one, they are listed")
+    signal = parser.add_argument("signal", nargs="*", help="block.port or block.port[2]; without one, they are listed")
+    variable(signal, "SIGNALS", words=True)
     parser.add_argument("--every", type=int, metavar="N", help="only steps whose number is a multiple of N")
     parser.add_argument("--rows", type=int, metavar="N", help="end after so many (when interrupted)")
     parser.add_argument("--trigger", help="wait until a signal crosses a value: 'a.out>3' upwards, 'a.out<3' downwards")
@@ -430,7 +450,7 @@ def _init(arguments: argparse.Namespace) -> None:
 
 
 def _init_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("directory", type=Path, help="a new or empty one")
+    variable(parser.add_argument("directory", type=Path, help="a new or empty one"), "FLEET")
 
 
 def _new_app(arguments: argparse.Namespace) -> None:
@@ -454,7 +474,8 @@ def _import_model(arguments: argparse.Namespace) -> None:
 
 
 def _import_model_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, metavar="zip", help="archive of packNGo(buildInfo) in MATLAB")
+    archive = parser.add_argument("archive", type=Path, metavar="zip", help="archive of packNGo(buildInfo) in MATLAB")
+    variable(archive, "ZIP")
     parser.add_argument("name", help="of the app, and of its directory in apps/")
     parser.add_argument("--model", help="its name, where the archive has several")
     parser.add_argument("--sample-times", type=_seconds, metavar="S,…", help="in seconds, fastest first, for a new app")
@@ -607,10 +628,11 @@ def _convert(arguments: argparse.Namespace) -> None:
 def _convert_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="NAME.mcap, NAME.csv or NAME.mat; it must not be there")
     parser.add_argument("--topic", help="the only one of several; CSV holds one")
-    parser.add_argument(
+    files = parser.add_argument(
         "files", type=Path, nargs="+", metavar="FILE",
         help="of a recorder, NAME-000001.rec, or folders of such; or a recording of `make record`",
     )  # fmt: skip
+    variable(files, "FILE", words=True)
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -622,13 +644,11 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _report_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "files",
-        type=Path,
-        nargs="+",
-        metavar="FILE",
+    files = parser.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE",
         help="a recording of `make record`, or files of a recorder, *.rec",
-    )
+    )  # fmt: skip
+    variable(files, "FILE", words=True)
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (build/reports/NAME.html)")
 
 
@@ -640,11 +660,17 @@ def _provision(arguments: argparse.Namespace) -> None:
 
 def _provision_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", type=int, help="this one only")
-    parser.add_argument("--guests", action="store_true", help="the virtual fleet instead of the robots")
-    parser.add_argument("--playbook", default="fleet", help="of ansible/ (%(default)s)")
+    guests = parser.add_argument("--guests", action="store_true", help="the virtual fleet instead of the robots")
+    variable(guests, "ON", value="guests")
     parser.add_argument(
-        "words", nargs="*", metavar="-- …", help="further arguments of ansible-playbook: -- --check --diff"
+        "--playbook",
+        default="fleet",
+        help="fleet, tasks, collect, reboot, replace or update: of ansible/ (%(default)s)",
     )
+    words = parser.add_argument(
+        "words", nargs="*", metavar="-- …", help="further arguments of ansible-playbook, such as --check --diff"
+    )
+    variable(words, "ARGS", words=True)
 
 
 def _completion(arguments: argparse.Namespace) -> None:
@@ -659,64 +685,105 @@ def _completion_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="name of the shell")
 
 
+def _make(arguments: argparse.Namespace) -> None:
+    """Of `help`; `flotilla.cli.main` takes the words of any other target instead."""
+    import os
+
+    from flotilla.cli import make, make_help
+    from flotilla.cli.main import commands
+
+    if arguments.target != make.HELP:
+        raise make.unknown_target(commands(), arguments.target)
+    print(make_help.text(commands(), os.environ.get("TARGET", "")), end="")
+
+
+def _make_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("target", help="such as image; its variables come from the environment: ROBOT=3")
+
+
 COMMANDS = (
-    Command("Cards", "image", "build the card image of one robot, or of all", _image, _image_arguments),
-    Command("Cards", "flash", "write a card and read it back", _flash, _flash_arguments),
-    Command("Cards", "kernel", "compile the lean PREEMPT_RT kernel as a Debian package", _kernel, _kernel_arguments),
+    Command("Cards", "image", "build the card image of one robot, or of all", _image, _image_arguments, targets=(
+        Target("image", "build the card image of one robot", "ROBOT=3", takes=("ROBOT",)),
+        Target("images", "build the card images of all robots", given={"ALL": "1"}, takes=()),
+    )),
+    Command("Cards", "flash", "write a card and read it back", _flash, _flash_arguments,
+            example="ROBOT=3 DEV=/dev/sdX"),
+    Command("Cards", "kernel", "compile the lean PREEMPT_RT kernel as a Debian package", _kernel, _kernel_arguments,
+            example="BOARD=smartcoret3"),
     Command("Cards", "verify", "build an image a second time and compare every byte", _verify,
-            _verify_arguments),
+            _verify_arguments, example="ROBOT=3"),
     Command("Cards", "verify-bundle", "rebuild a published bundle and compare it", _verify_bundle,
-            _verify_bundle_arguments),
-    Command("Cards", "size", "list the largest packages and files of an image", _size, robot_argument),
-    Command("Cards", "bundle", "build the update bundle of a board", _bundle, _bundle_arguments),
-    Command("Inputs", "init", "make a directory for a fleet of your own", _init, _init_arguments, host=()),
+            _verify_bundle_arguments, example="BUNDLE=smartcoret3.bundle"),
+    Command("Cards", "size", "list the largest packages and files of an image", _size, robot_argument,
+            example="ROBOT=3"),
+    Command("Cards", "bundle", "build the update bundle of a board", _bundle, _bundle_arguments,
+            example="BOARD=smartcoret3 EXPIRES=2027-01-31"),
+    Command("Inputs", "init", "make a directory for a fleet of your own", _init, _init_arguments, host=(),
+            example="FLEET=../rovers"),
     Command("Inputs", "check-fleet", "validate the inventory", _check_fleet, host=()),
-    Command("Inputs", "lock", "resolve package lists to exact versions and hashes", _lock, _lock_arguments),
-    Command("Inputs", "cve", "check the locks against Debian's security tracker", _cve, _cve_arguments),
+    Command("Inputs", "lock", "resolve package lists to exact versions and hashes", _lock, _lock_arguments,
+            example="ONLY=smartcoret3"),
+    Command("Inputs", "cve", "check the locks against Debian's security tracker", _cve, _cve_arguments,
+            example="TRACKER=tracker.json"),
     Command("Keys", "rotate-key", "replace the key of a robot or of the operator", _rotate_key,
-            _rotate_key_arguments),
+            _rotate_key_arguments, example="ROBOT=3"),
     Command("Keys", "revoke-key", "revoke the host key of a stolen robot", _revoke_key,
-            robot_argument),
+            robot_argument, example="ROBOT=3"),
     Command("Keys", "admit-operator", "issue a certificate that lets a person into all robots",
-            _admit_operator, _admit_operator_arguments),
-    Command("Keys", "revoke-operator", "revoke a person's certificates", _revoke_operator, _revoke_operator_arguments),
+            _admit_operator, _admit_operator_arguments, example="NAME=alice KEY_FILE=alice.pub DAYS=30"),
+    Command("Keys", "revoke-operator", "revoke a person's certificates", _revoke_operator, _revoke_operator_arguments,
+            example="NAME=alice"),
     Command("Keys", "operators", "list the certificates: name, expiry, revocation", _operators, host=()),
-    Command("Keys", "backup-keys", "write all keys to one encrypted file", _backup_keys, _key_backup_arguments),
-    Command("Keys", "restore-keys", "restore all keys from an encrypted file", _restore_keys, _key_backup_arguments),
-    Command("Robots", "ssh", "open a shell on a robot, or on its guest if one runs", _ssh, robot_argument),
-    Command("Robots", "param", "list or set the parameters of a running task or app", _param, _param_arguments),
-    Command("Robots", "scope", "show or record the signals of a running task", _scope, _scope_arguments),
+    Command("Keys", "backup-keys", "write all keys to one encrypted file", _backup_keys, _backup_keys_arguments,
+            example="OUT=keys.age"),
+    Command("Keys", "restore-keys", "restore all keys from an encrypted file", _restore_keys, _restore_keys_arguments,
+            example="FILE=keys.age"),
+    Command("Robots", "ssh", "open a shell on a robot, or on its guest if one runs", _ssh, robot_argument,
+            example="ROBOT=3"),
+    Command("Robots", "param", "list or set the parameters of a running task or app", _param, _param_arguments,
+            example="ROBOT=1 TASK=heading PARAM=attitude.kp VALUE=2.5"),
+    Command("Robots", "scope", "show or record the signals of a running task", _scope, _scope_arguments,
+            example="ROBOT=1 TASK=heading SIGNALS=gyro.rate ROWS=20 CSV=turn.csv"),
     Command("Robots", "releases", "list the release of each robot, and its trial state",
             _releases, _releases_arguments),
     Command("Robots", "hwcheck", "write a robot's hardware to a file, or draft a board's file",
-            _hwcheck, _hwcheck_arguments),
-    Command("Robots", "provision", "apply the inventory to the robots", _provision, _provision_arguments),
+            _hwcheck, _hwcheck_arguments, example="TARGET=ssh:debian@10.0.0.7 NAME=nuc7"),
+    Command("Robots", "provision", "apply the inventory to the robots", _provision, _provision_arguments, targets=(
+        Target("provision", example="ROBOT=3 ARGS='--check --diff'"),
+        Target("update", "install the update bundle on the robots", "ROBOT=3", given={"PLAYBOOK": "update"}),
+    )),
     Command("Robots", "station", "serve a page that shows, drives and tunes the fleet", _page, _page_arguments,
-            packages="station"),
+            packages="station", example="PORT=8080"),
     Command("Robots", "record", "record telemetry to an MCAP file", _station, _record_arguments,
-            packages="station"),
-    Command("Robots", "live", "stream live telemetry to Foxglove", _station, _live_arguments, packages="station"),
+            packages="station", example="OUT=run.mcap SECONDS=60"),
+    Command("Robots", "live", "stream live telemetry to Foxglove", _station, _live_arguments, packages="station",
+            example="PORT=8765 ORIGIN=http://localhost:8080"),
     Command("Robots", "top", "show a live telemetry table; start and stop tasks by key",
-            _station, _top_arguments, packages="station"),
+            _station, _top_arguments, packages="station", example="ASK=1"),
     Command("Robots", "station-join", "join the robots' ad hoc cell with this computer's radio", _station_join,
-            _station_join_arguments),
+            _station_join_arguments, example="ADAPTER=wlan0"),
     Command("Robots", "station-leave", "leave the cell and restore the adapter's settings", _station_leave,
-            _station_leave_arguments),
+            _station_leave_arguments, example="ADAPTER=wlan0"),
     Command("Robots", "station-time", "write the chrony files that make this computer the clock", _station_time,
-            _station_time_arguments),
+            _station_time_arguments, example="STATION=station"),
     Command("Robots", "drive", "drive a wheeled robot by keyboard or gamepad", _drive, _drive_arguments,
-            packages="station"),
+            packages="station", example="ROBOT=5 INPUT=gamepad"),
     Command("Robots", "positions", "forward indoor positions to a robot, authenticated", _positions,
-            _positions_arguments, packages="station"),
-    Command("Robots", "fetch", "copy the recorder files of a robot's task", _fetch, _fetch_arguments),
+            _positions_arguments, packages="station", example="ROBOT=3 INTERFACE=eth1"),
+    Command("Robots", "fetch", "copy the recorder files of a robot's task", _fetch, _fetch_arguments,
+            example="ROBOT=3 TASK=heading"),
     Command("Robots", "convert", "convert recordings to MCAP, CSV or MAT", _convert, _convert_arguments,
-            packages="station", host=()),
+            packages="station", host=(), example="FILE='log-000001.rec log-000002.rec' OUT=run.mcap"),
     Command("Robots", "report", "write a page of plots from recordings", _report, _report_arguments,
-            packages="station", host=()),
-    Command("Apps", "new-app", "create a working example app in apps/NAME", _new_app, _new_app_arguments, host=()),
+            packages="station", host=(), example="FILE=run.mcap OUT=page.html"),
+    Command("Apps", "new-app", "create a working example app in apps/NAME", _new_app, _new_app_arguments, host=(),
+            example="KIND=block NAME=hover"),
     Command("Apps", "import-model", "import MATLAB's packNGo archive as apps/NAME", _import_model,
-            _import_model_arguments),
-    Command("Apps", "deploy", "build an app, copy it to a robot and start it", _deploy, _deploy_arguments),
+            _import_model_arguments, example="ZIP=hover.zip NAME=hover SAMPLE_TIMES=0.01,0.05"),
+    Command("Apps", "deploy", "build an app, copy it to a robot and start it", _deploy, _deploy_arguments,
+            example="ROBOT=3 APP=apps/hover KEEP=1"),
     Command("Shell", "completion", "print a completion script for a shell", _completion,
-            _completion_arguments, packages="station", host=()),
+            _completion_arguments, packages="station", host=(), targets=()),
+    Command("Shell", "make", "run a target of make with the variables of the environment", _make,
+            _make_arguments, packages="station", host=(), targets=()),
 )  # fmt: skip

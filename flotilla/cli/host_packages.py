@@ -1,6 +1,6 @@
-"""Debian packages that a command needs on this computer.
+"""Debian packages that a command needs on this computer: the command installs them.
 
-`make` installs them before it starts a command. Where the tool was installed as a package, the command does.
+In a checkout, `make setup` has installed those of the list `build` before there was a Python for commands.
 """
 
 from __future__ import annotations
@@ -23,10 +23,13 @@ _SCRIPTS = paths.PROJECT / "images"
 
 def install(command: Command) -> None:
     """Install the packages that are missing, by apt. UserError where that is not possible."""
-    if not paths.INSTALLED or not command.host:
+    lists = [str(LISTS[name]) for name in command.host if paths.INSTALLED or name != "build"]
+    if not lists:
         return
-    lists = [str(LISTS[name]) for name in command.host]
-    for script in ([_SCRIPTS / "check-host"], [_SCRIPTS / "install-host-packages", *lists]):
+    scripts = [[str(_SCRIPTS / "install-host-packages"), *lists]]
+    if paths.INSTALLED:
+        scripts.insert(0, [str(_SCRIPTS / "check-host")])
+    for script in scripts:
         done = subprocess.run(["sh", *script], stdout=2, env=os.environ | {"LC_ALL": "C.UTF-8"}, check=False)
         if done.returncode:
             raise UserError(f"flotilla {command.name} needs Debian packages that could not be installed; see above")

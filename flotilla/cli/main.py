@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from itertools import groupby
 
-from flotilla.cli import host_packages
+from flotilla.cli import host_packages, make
 from flotilla.cli.command import Command
 from flotilla.common import paths, sudo
 from flotilla.common.errors import UserError
@@ -63,9 +63,14 @@ def parser(known: Sequence[Command], detailed: Callable[[Command], bool]) -> arg
 def main() -> int:
     os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"  # there are none, and to look for them reads every package
     known = commands()
-    word = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
+    words = sys.argv[1:]
+    word = next((word for word in words if not word.startswith("-")), None)
     try:
-        arguments = parser(known, lambda command: word in (command.name, "completion")).parse_args()
+        if word == make.WORD and (target := make.targets(known).get(words[-1])):
+            word = target[0].name  # first: reading its arguments may import packages that are missing
+            words = make.words(known, words[-1])
+            make.show(words)
+        arguments = parser(known, lambda command: word in (command.name, "completion")).parse_args(words)
         paths.check()
         command = next(command for command in known if command.name == arguments.command)
         caller = sudo.caller()

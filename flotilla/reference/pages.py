@@ -10,7 +10,11 @@ from flotilla.fleet import privileges
 from flotilla.reference import blocks, commands, keys, task_file
 
 FOLDER: Path = paths.PROJECT / "docs" / "reference"
-PAGES: dict[str, Callable[[], str]] = {"commands.md": commands.page, "keys.md": keys.page}
+PAGES: dict[str, Callable[[], str]] = {
+    "commands.md": commands.page,
+    "targets.txt": commands.targets,
+    "keys.md": keys.page,
+}
 """By file: what makes it."""
 RUNTIME_PAGES: dict[Path, Callable[[Path], str]] = {
     FOLDER / "blocks.md": blocks.page,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.variables import variable
 from flotilla.fleet import inventory
 from flotilla.fleet.model import STATIONS, Fleet
 from flotilla.station import station_keys
@@ -69,15 +70,17 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def record_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    record = parser.add_argument(
         "record", nargs="?", type=Path, default=_file(), metavar="FILE", help="(build/recordings/DATE.mcap)"
     )
+    variable(record, "OUT")
     _live_option(parser)
     _common(parser)
 
 
 def live_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("live", nargs="?", type=int, default=PORT, metavar="PORT", help="TCP port (%(default)s)")
+    port = parser.add_argument("live", nargs="?", type=int, default=PORT, metavar="PORT", help="TCP port (%(default)s)")
+    variable(port, "PORT")
     _record_option(parser)
     _common(parser)
 
@@ -95,29 +98,30 @@ def _file() -> Path:
 
 
 def _record_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--record",
-        nargs="?",
-        type=Path,
-        const=_file(),
-        metavar="FILE",
-        help=f"record it, too: {_FILE}",
+    record = parser.add_argument(
+        "--record", nargs="?", type=Path, const=_file(), metavar="FILE", help=f"record it, too: {_FILE}"
     )
+    variable(record, "OUT")
 
 
 def _live_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    live = parser.add_argument(
         "--live", nargs="?", type=int, const=PORT, metavar="PORT", help=f"serve it to Foxglove, too ({PORT})"
     )
+    variable(live, "PORT")
 
 
 def _common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--live-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
+    live = parser.add_argument("--live-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
+    variable(live, "ADDRESS")
     parser.add_argument(
         "--origin", action="append", default=[], help="a web page that may connect, http://localhost:8080 for instance"
     )
     parser.add_argument("--seconds", type=float, help=f"end after so many ({TOP_S:g} for top alone on no terminal)")
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
-    parser.add_argument("--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)")
+    address = parser.add_argument(
+        "--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)"
+    )
+    variable(address, "RECEIVE_ADDRESS")
     if parser.get_default("top") is None:
         parser.set_defaults(top=False, ask=False)

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.common.variables import variable
 from flotilla.fleet import inventory
 from flotilla.station import inputs, station_keys
 from flotilla.station.driving import TASK, Driving, Motion, Operator, Refused, State
@@ -236,6 +237,7 @@ def drive_arguments(parser: argparse.ArgumentParser) -> None:
         "--input", default=inputs.KEYBOARD, help=f"{inputs.KEYBOARD}, {inputs.GAMEPAD}, or its node (%(default)s)"
     )
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
-    parser.add_argument(
+    address = parser.add_argument(
         "--address", default="0.0.0.0", help="this computer's, to send from and receive at (%(default)s)"
     )
+    variable(address, "RECEIVE_ADDRESS")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.common.variables import variable
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
 from flotilla.station import station_keys
@@ -118,9 +119,13 @@ def _address(text: str) -> str:
 
 def page_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=PORT, help="TCP port of the page (%(default)s)")
-    parser.add_argument("--page-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
+    page = parser.add_argument("--page-address", default="127.0.0.1", help="this computer's, to serve at (%(default)s)")
+    variable(page, "ADDRESS")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="show a recording instead of robots")
-    parser.add_argument("--record", type=Path, metavar="FILE", help="record from the start")
+    variable(parser.add_argument("--record", type=Path, metavar="FILE", help="record from the start"), "OUT")
     parser.add_argument("--seconds", type=float, help="end after so many")
     parser.add_argument("--inventory", type=Path, default=paths.INVENTORY, help="the fleet's description (%(default)s)")
-    parser.add_argument("--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)")
+    address = parser.add_argument(
+        "--address", default="0.0.0.0", help="this computer's, to receive at (%(default)s: any)"
+    )
+    variable(address, "RECEIVE_ADDRESS")

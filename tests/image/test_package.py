@@ -104,6 +104,14 @@ def test_without_a_home_a_command_names_the_remedy(installed: Path, tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_make_in_the_home_runs_the_installed_tool(installed: Path, lab: Path) -> None:
+    kept = {name: value for name, value in os.environ.items() if name not in ("BUILD", "FLEET", "INVENTORY", "KEYS")}
+    environment = kept | {"PATH": f"{installed.parent}:{kept['PATH']}"}
+    for words, said in ((["check-fleet"], "lab: 1 robot"), (["help", "TARGET=flash"], "make flash ROBOT=3")):
+        done = subprocess.run(["make", *words], cwd=lab, env=environment, capture_output=True, text=True, check=False)
+        assert (done.returncode, said in done.stdout) == (0, True), done.stdout + done.stderr
+
+
 def test_an_installed_tool_makes_the_card_that_the_checkout_makes(installed: Path, lab: Path) -> None:
     done = run(installed, "image", "1", where=lab)
     assert done.returncode == 0, done.stderr

@@ -5,7 +5,6 @@ Building one and running it is tested on a guest, in tests/provisioning/test_dep
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -14,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from flotilla.apps import app, builder, deploy, remote, scaffold
+from flotilla.cli import make
+from flotilla.cli.main import commands
 from flotilla.common import paths
 from flotilla.common.errors import UserError
 from flotilla.debian import runtime
@@ -261,21 +262,14 @@ def test_words_of_a_remote_compiler_are_shown_and_kept(tmp_path: Path, capsys: p
 
 
 @pytest.mark.parametrize(
-    ("words", "build", "on_robot"),
-    [
-        (["ON_ROBOT=1"], "build", True),
-        (["ON_ROBOT=1", "BUILD=other"], "other", True),
-        (["BUILD=other"], "other", False),
-        (["ON_ROBOT=0"], "build", False),
-    ],
-)
-def test_how_make_is_asked_for_a_remote_build(words: list[str], build: str, on_robot: bool) -> None:
+    ("given", "on_robot"),
+    [({"ON_ROBOT": "1"}, True), ({"ON_ROBOT": "1", "BUILD": "other"}, True), ({"BUILD": "other"}, False),
+     ({"ON_ROBOT": "0"}, False)],
+)  # fmt: skip
+def test_how_make_is_asked_for_a_remote_build(given: dict[str, str], on_robot: bool) -> None:
     """BUILD is the directory of outputs and nothing else."""
-    environment = {name: value for name, value in os.environ.items() if name != "BUILD"}
-    argv = ["make", "-n", "-C", str(paths.PROJECT), "deploy", "ROBOT=3", "APP=apps/hover", *words]
-    said = subprocess.run(argv, env=environment, capture_output=True, text=True, check=True).stdout
-    assert f"\n{build}/venv/bin/python -m flotilla deploy" in f"\n{said}"
-    assert ("--on-robot" in said) == on_robot
+    words = make.words(commands(), "deploy", {"ROBOT": "3", "APP": "apps/hover", **given})
+    assert words == ["deploy", *(["--on-robot"] if on_robot else []), "--", "3", "apps/hover"]
 
 
 def test_an_unknown_run() -> None:

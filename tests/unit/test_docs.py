@@ -10,12 +10,15 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
+from flotilla.cli import make
+from flotilla.cli.main import commands
 from flotilla.common import paths
 from flotilla.debian import kernel
 from flotilla.debian.lock import read_lock
 from flotilla.fleet import identity, inventory, privileges
 from flotilla.fleet.model import Fleet
 from flotilla.images import build, space
+from flotilla.reference.commands import MAKEFILES
 
 TROUBLESHOOTING = paths.PROJECT / "docs" / "troubleshooting.md"
 OUTPUTS = ("build/", "apps/", "ansible/keys/")
@@ -61,11 +64,25 @@ def dead_links(text: str, folder: Path) -> list[str]:
 
 def unknown_targets(text: str) -> set[str]:
     """What stands in code as `make TARGET`, and is not in `make help`."""
-    argv = ["make", "-C", str(paths.PROJECT), "help"]
+    argv = ["make", "-C", str(paths.PROJECT), "help", "TARGET=all"]
     shown = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
     return set(re.findall(r"(?:`|^)(?:sudo )?make (?:-C \S+ )?([a-z-]+)", text, re.MULTILINE)) - set(
         re.findall(r"^  ([a-z-]+) ", shown, re.MULTILINE)
     )
+
+
+MAKE_CODE = re.compile(r"make ((?:-C \S+ )?)([a-z-]+(?: [a-z-]+)*)((?: [A-Z_0-9]+=(?:\"[^\"]*\"|'[^']*'|[^\s\"'`]+))+)")
+
+
+def unknown_variables(text: str) -> list[str]:
+    """Variables of targets in code that the target does not have: `make image ROBT=3`."""
+    listed, found = make.targets(commands()), []
+    for _, targets, given in MAKE_CODE.findall(text):
+        ours = [listed[each] for each in targets.split() if each in listed]
+        known = set(make.GLOBAL).union(*(make.variables(make.own_parser(command), of) for command, of in ours))
+        names = re.findall(r" ([A-Z_0-9]+)=", given)
+        found += [f"{targets} {name}" for name in names if ours and name not in known]
+    return found
 
 
 @functools.cache
@@ -89,6 +106,7 @@ def test_what_a_document_names_exists(document: str) -> None:
     assert missing_paths(text) == []
     assert dead_links(text, Path(document).parent) == []
     assert unknown_targets(text) == set()
+    assert unknown_variables(text) == []
 
 
 def test_messages_of_troubleshooting_are_the_programs() -> None:
@@ -109,6 +127,7 @@ def test_each_check_sees_what_is_wrong() -> None:
     assert missing_paths("kernel/fragments/NAME.confg") == ["kernel/fragments/NAME.confg"]
     assert dead_links(wrong, Path()) == ["docs/stile.md"]
     assert unknown_targets(wrong) == {"imgae"}
+    assert unknown_variables("`make image ROBT=3`, `make images check-fleet FLEET=x`") == ["image ROBT"]
     assert unsaid("| `no slot left, … all again` | |\n| `no slot right` | |\n") == ["no slot right"]
 
 
@@ -152,10 +171,14 @@ TUTORIAL = paths.PROJECT / "docs" / "tutorial.md"
 
 
 def prerequisites(target: str) -> set[str]:
-    """Targets of make that `target` runs before it, through any number of others."""
-    makefile = (paths.PROJECT / "Makefile").read_text()
-    rules = re.findall(r"^([a-z-]+):([^#\n]*)", makefile, re.MULTILINE)
+    """Targets of make that install packages, and those that `target` runs before it, through any number of others."""
+    makefiles = "".join((paths.PROJECT / name).read_text() for name in MAKEFILES)
+    rules = re.findall(r"^([a-z-]+):([^#\n]*)", makefiles, re.MULTILINE)
     direct = {name: set(words.replace("|", " ").split()) for name, words in rules}
+    direct |= {
+        name: {"setup", *(f"setup-{each}" for each in command.host if each != "build")}
+        for name, (command, _) in make.targets(commands()).items()
+    }
     found: set[str] = set()
     todo = {target}
     while todo:

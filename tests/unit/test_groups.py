@@ -17,7 +17,8 @@ from pathlib import Path
 import grimp
 import pytest
 
-from flotilla.cli.command import Command
+from flotilla.cli import host_packages, make
+from flotilla.cli.command import Command, HostList
 from flotilla.cli.main import OURS, commands
 from flotilla.common import paths
 
@@ -115,7 +116,7 @@ def test_a_command_imports_packages_of_its_group_alone(imports: grimp.ImportGrap
 def test_a_command_of_the_station_needs_it(imports: grimp.ImportGraph, command: Command) -> None:
     """Otherwise it works without, and nobody has to install 300 MB for it."""
     starts = of_command(command)
-    if command.name == "completion":
+    if command.name in ("completion", "make"):
         starts |= {module for each in commands() for module in of_command(each)}
     assert too_much(imports, starts, "build")
 
@@ -171,14 +172,37 @@ def all_of(targets: dict[str, tuple[set[str], str]], target: str) -> set[str]:
 
 
 def test_a_make_target_installs_the_group_of_its_command_and_no_more() -> None:
-    targets, checked = make_targets(), set()
-    groups = {command.name: command.packages for command in commands()}
-    for target, (_, recipe) in targets.items():
-        for name in re.findall(r"\$\(FLOTILLA\) ([\w-]+)", recipe):
-            installed = {each for each in GROUPS if f"build/venv/.{each}" in all_of(targets, target)}
-            assert "tests" in installed or installed == set(GROUPS[: GROUPS.index(groups[name]) + 1]), target
-            checked.add(name)
-    assert {"image", "station", "boot", "latency", "check-fleet"} <= checked
+    listed = make_targets()
+    for name, (command, _) in make.targets(commands()).items():
+        installed = {each for each in GROUPS if f"build/venv/.{each}" in all_of(listed, name)}
+        assert installed == set(GROUPS[: GROUPS.index(command.packages) + 1]), name
+
+
+@pytest.mark.parametrize(
+    ("installed", "host", "lists"),
+    [
+        (False, ("build", "lab"), ["flotilla/lab/host-packages.txt"]),
+        (False, ("build",), []),
+        (True, ("build", "lab"), ["images/host-packages.txt", "flotilla/lab/host-packages.txt"]),
+        (True, (), []),
+    ],
+)
+def test_a_command_installs_its_debian_packages(
+    monkeypatch: pytest.MonkeyPatch, installed: bool, host: tuple[HostList, ...], lists: list[str]
+) -> None:
+    """In a checkout `make setup` has installed those of the list `build`."""
+    called: list[list[str]] = []
+
+    def run(argv: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        called.append(argv)
+        return subprocess.CompletedProcess(argv, 0)
+
+    monkeypatch.setattr(paths, "INSTALLED", installed)
+    monkeypatch.setattr(subprocess, "run", run)
+    host_packages.install(Command("Lab", "work", "does it", lambda _: None, host=host))
+    scripts = ["check-host"] * installed + ["install-host-packages"] if lists else []
+    assert [Path(argv[1]).name for argv in called] == scripts
+    assert called[-1:] == ([["sh", *called[-1][1:2], *(str(paths.PROJECT / each) for each in lists)]] if lists else [])
 
 
 def without(tmp_path: Path, module: str, *words: str) -> subprocess.CompletedProcess[str]:

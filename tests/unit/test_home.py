@@ -153,6 +153,41 @@ def test_a_new_home_has_all_its_files_by_git(fleet_home: Path) -> None:
     assert sorted(listed) == sorted(path for path in there if not path.startswith(".git/"))
 
 
+PROGRAM = f"""#!/bin/sh
+PYTHONPATH={paths.PROJECT} exec {sys.executable} -m flotilla "$@"
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["check-fleet"], 0, "rover-lab-2: 1 robot, 1 station"),
+        ([], 0, "  image        build the card image of one robot\n"),
+        (["help", "TARGET=flash"], 0, "example: make flash ROBOT=3 DEV=/dev/sdX\n"),
+        (["image", "ROBT=1"], 2, "make image ROBT=…: there is no such variable; the nearest is ROBOT"),
+        (["check-fleet", "image", "ROBOT=$HOME'\"`"], 2, "invalid int value: '$HOME\\'\"`'"),
+        (["kernel", "BOARD=none"], 2, "none"),  # although the home may have a folder of this name
+        (["imgae"], 2, "error: make imgae: there is no such target; the nearest is image"),
+    ],
+)
+def test_make_in_a_home_hands_targets_to_the_installed_program(
+    fleet_home: Path, tmp_path: Path, words: list[str], status: int, said: str
+) -> None:
+    """Without a checkout. Seen to fail with values that make expands, and with a folder `kernel` that is up to date."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "flotilla").write_text(PROGRAM)
+    (programs / "flotilla").chmod(0o755)
+    (fleet_home / "kernel").mkdir()
+    ours = ("FLEET", "BUILD", "KEYS", "APPS", "INVENTORY")
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    environment = kept | {"PATH": f"{programs}:{kept['PATH']}"}
+    done = subprocess.run(
+        ["make", *words], cwd=fleet_home, env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, said in done.stdout + done.stderr) == (status, True), done.stdout + done.stderr
+
+
 def test_a_file_of_the_home_takes_the_place_of_the_tools(at_home: Path) -> None:
     name = PurePosixPath("etc/flotilla/irq-priorities")
     before = sources.layered(paths.OVERLAY)

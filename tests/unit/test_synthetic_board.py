@@ -13,7 +13,6 @@ import hashlib
 import json
 import re
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,8 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
+from flotilla.cli import make
+from flotilla.cli.main import commands
 from flotilla.common import paths, yaml_file
 from flotilla.common.errors import ProblemsError, UserError
 from flotilla.debian import kernel, lock
@@ -262,14 +263,12 @@ def test_scenarios_fly_it(own: Path) -> None:
     assert b"setserial /dev/%k port 0x2a0" in rules
 
 
-@pytest.mark.parametrize("target", ["kernel", "latency", "boot-time", "scenarios", "latency-accept", "fleet-scale N=2"])
+@pytest.mark.parametrize("target", ["kernel", "latency", "boot-time", "scenarios", "latency-accept", "fleet-scale"])
 def test_make_passes_its_name_on_and_has_none_by_itself(target: str) -> None:
-    def said(*more: str) -> str:
-        argv = ["make", "-n", "-C", str(paths.PROJECT), *target.split(), *more]
-        return subprocess.run(argv, capture_output=True, text=True, check=True).stdout
-
-    assert f"'{NAME}'" in said(f"BOARD={NAME}")
-    assert "smartcoret3" not in said()
+    given = {"N": "2"} if target == "fleet-scale" else {}
+    named = make.words(commands(), target, {"BOARD": NAME, **given})
+    assert [word.removeprefix("--board=") for word in named].count(NAME) == 1
+    assert "smartcoret3" not in " ".join(make.words(commands(), target, given))
 
 
 # --- what is missing or wrong ---

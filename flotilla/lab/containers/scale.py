@@ -28,6 +28,7 @@ import yaml
 
 from flotilla.common import ansible, cache, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.variables import variable
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet
 from flotilla.images.build import image_of
@@ -295,7 +296,7 @@ def grow(count: int, board: str | None) -> None:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("count", type=int, help="of robots; its halves are measured too")
+    variable(parser.add_argument("count", type=int, help="of robots; its halves are measured too"), "N")
     parser.add_argument("--board", help="name in the inventory (that of the first robot)")
 
 

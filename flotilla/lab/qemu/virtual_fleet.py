@@ -25,6 +25,7 @@ import yaml
 
 from flotilla.common import durable, paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.variables import variable
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Fleet, Health, Robot
 from flotilla.images.build import build, image_of
@@ -261,7 +262,7 @@ def _say(ports: Mapping[str, int], how: str) -> None:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", choices=("up", "status", "down", "hold"), help="hold: what `up` leaves running")
-    parser.add_argument("count", type=int, nargs="?", help="of guests, for up")
+    variable(parser.add_argument("count", type=int, nargs="?", help="of guests, for up"), "N")
     parser.add_argument("--link", choices=("ethernet", "ibss"), help="of the guests, instead of the inventory's")
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 
 from flotilla.common import paths, progress
 from flotilla.common.errors import UserError
+from flotilla.common.variables import variable
 from flotilla.debian import kernel
 from flotilla.fleet import inventory
 from flotilla.fleet.model import Board
@@ -127,8 +128,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="side of the square (%(default)s m)",
     )
-    parser.add_argument("--guests", action="store_true", help="in real time, by guests of the card images")
-    parser.add_argument("--lockstep", action="store_true", help="in virtual time, a guest for each computer")
+    real = parser.add_argument("--guests", action="store_true", help="in real time, by guests of the card images")
+    virtual_time = parser.add_argument(
+        "--lockstep", action="store_true", help="in virtual time, a guest for each computer"
+    )
+    variable(real, "ON", value="guests")
+    variable(virtual_time, "ON", value="lockstep")
     parser.add_argument(
         "--link",
         choices=tuple(guests.HOW),

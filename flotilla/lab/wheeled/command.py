@@ -10,6 +10,7 @@ from contextlib import ExitStack
 
 from flotilla.common import paths
 from flotilla.common.errors import UserError
+from flotilla.common.variables import variable
 from flotilla.lab.qemu import holder
 from flotilla.lab.qemu.timing import LabError
 from flotilla.lab.wheeled import live
@@ -23,7 +24,8 @@ _LOOK_S = 1.0
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("count", type=int, nargs="?", default=1, help="of robots, up to 3 (%(default)s)")
+    count = parser.add_argument("count", type=int, nargs="?", default=1, help="of robots, up to 3 (%(default)s)")
+    variable(count, "N")
     parser.add_argument("--room", default="corner", help="a file in flotilla/lab/plants/rooms (%(default)s)")
 
 
