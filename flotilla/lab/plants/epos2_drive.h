@@ -1,6 +1,6 @@
-/* A Maxon EPOS2 drive as a CANopen slave, for plants in virtual time, where flotilla/lab/emulators/epos2.py is too slow: the
- * same facts and the same behaviour, as far as control tasks use it. It takes and returns frames, and is given the
- * time.
+/* A Maxon EPOS2 drive as a CANopen slave, for plants in virtual time, where flotilla/lab/emulators/epos2.py is too
+ * slow: the same facts and the same behaviour, as far as control tasks use it. It takes and returns frames, and is
+ * given the time.
  *
  * It knows SDO (expedited), NMT, heartbeats both ways, EMCY, PDOs that are sent at each SYNC and taken at once, and the
  * state machine of CiA 402 in the modes position (-1), velocity (-2), current (-3) and homing (6) by an end stop that

@@ -1,6 +1,6 @@
 /* A Hokuyo URG-04LX at a pseudo terminal, as over USB, which has no bit rate: SCIP 2.0 as far as the block urg needs
- * it, for plants in virtual time, where flotilla/lab/emulators/urg.py is too slow. Facts: communication protocol specification
- * for SCIP 2.0, C-42-03320B. It knows QT, BM, RS, TM2, MD and MS; all else it answers with status 0E. */
+ * it, for plants in virtual time, where flotilla/lab/emulators/urg.py is too slow. Facts: communication protocol
+ * specification for SCIP 2.0, C-42-03320B. It knows QT, BM, RS, TM2, MD and MS; all else it answers with status 0E. */
 #define _GNU_SOURCE
 #include "wheeled.h"
 
