@@ -1,7 +1,7 @@
 """Ways to bring a release to robots that have the one before, measured: `python -m evidence.deltas OLD NEW`.
 
 OLD and NEW are what a slot holds. Memory is the peak of the process that applies the delta on the robot. The record
-docs/decisions/0045-vcdiff-deltas.md has the figures on which was decided.
+docs/decisions/0051-vcdiff-deltas.md has the figures on which was decided.
 """
 
 from __future__ import annotations
