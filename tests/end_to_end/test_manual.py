@@ -73,6 +73,7 @@ ELSEWHERE = {
             '~/flotilla/bin/pip install -c constraints.txt "flotilla[station] @ file://$PWD/flotilla-0.1.0-py3-none-any.whl"',
             "~/flotilla/bin/flotilla init rovers",
             "cd rovers",
+            "export PATH=~/flotilla/bin:$PATH",
             "~/flotilla/bin/flotilla image 1",
         ),
         "is for another computer; image/test_package.py does the same",
