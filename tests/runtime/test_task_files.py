@@ -10,6 +10,7 @@ import pytest
 from flotilla.common import paths
 from flotilla.fleet import identity, messages
 from flotilla.fleet.inventory import load_fleet
+from flotilla.lab.latency import virtual_loop
 from flotilla.lab.scenarios import virtual
 from flotilla.lab.wheeled.by_wires import INVENTORY as WHEELED
 from tests.runtime.tasks import HEADERS, PLUGIN, Tasks, compile_shared, task
@@ -190,7 +191,7 @@ def test_plugins_come_from_several_directories_where_one_may_be_missing(tasks: T
     """Seen to fail when only the first directory is read."""
     own = tmp_path / "own"
     own.mkdir()
-    compile_shared(PLUGIN / "loopback.c", own / "loopback.so", f"-I{HEADERS}")
+    compile_shared(virtual_loop.PLUGIN, own / "loopback.so", f"-I{HEADERS}")
     file = tasks.write(task("bad: {type: misbehave, parameters: {manner: fail}}"))
     for directories in (f"{own}:{tasks.plugins}", f"{tmp_path / 'missing'}:{tasks.plugins}:{own}"):
         argv = [str(tasks.program), "--check", "--blocks", directories, str(file)]

@@ -62,7 +62,10 @@ def test_keys_on_a_terminal(tmp_path: Path) -> None:
                 end = time.monotonic() + PATIENCE
                 while answer not in said:
                     assert select.select([terminal], [], [], end - time.monotonic())[0], said
-                    said += os.read(terminal, 65536).decode(errors="replace")
+                    try:
+                        said += os.read(terminal, 65536).decode(errors="replace")
+                    except OSError as error:  # the program has ended
+                        raise AssertionError(f"after {key!r}: {said}") from error
             os.write(terminal, b"\x03")
             assert process.wait(PATIENCE) == 0
         finally:
