@@ -4,6 +4,7 @@ variables_fuzz := SECONDS SEED
 variables_test := TIER PART COSTS
 variables_test-all := PART
 variables_bench := ROBOT
+variables_wheel := OUT
 variables_bench-runtime := SECONDS ROUNDS
 $(foreach each,kernel clock others,$(eval variables_test-$(each) := $$(variables_test)))
 # These targets have a fixed fleet, so FLEET and INVENTORY are errors.
@@ -26,12 +27,12 @@ requirements: | setup ## lock the Python packages that pyproject.toml names agai
 	$(Q)$(locked) --group fuzz -o requirements/fuzz.lock
 
 # A package of the tool for computers without this checkout, and the versions of its dependencies that were tested.
-dist = $(BUILD)/dist
-wheel: | setup ## build the Python package of this tool in build/dist
-	$(Q)rm -rf $(dist)
-	$(Q)$(step) "package" $(PYTHON) -m hatchling build -d $(abspath $(dist))
+dist = $(if $(value OUT),$(call given,OUT),$(BUILD)/dist)
+wheel: | setup ## build the Python package of this tool in build/dist | [OUT=dir]
+	$(Q)mkdir -p $(dist); rm -f $(dist)/flotilla-*
+	$(Q)$(step) "package" $(PYTHON) -m hatchling build -d $(dist)
 	$(Q)sed -n 's/^\([A-Za-z0-9_.-]*==[^\\]*[^ \\]\).*/\1/p' requirements/station.lock >$(dist)/constraints.txt
-	$(Q)cd $(dist) && sha256sum * >SHA256SUMS && cat SHA256SUMS
+	$(Q)cd $(dist) && sha256sum flotilla-* constraints.txt >SHA256SUMS && cat SHA256SUMS
 
 check: | setup-tests lint check-runtime ## run lint, type checks and unit tests, without images
 	$(Q)$(VENV)/bin/pytest -q tests/unit

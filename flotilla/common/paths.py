@@ -35,8 +35,8 @@ HOME = Path(os.environ.get("FLEET") or ("." if INSTALLED else PROJECT)).resolve(
 """The fleet's home."""
 OWN_HOME = HOME != PROJECT
 """Whether the fleet lies outside of this tool."""
-CHECKOUT = HOME if INSTALLED else PROJECT
-"""The directory in which a user works."""
+WORKPLACE = HOME if INSTALLED else PROJECT
+"""The directory in which a user works: the checkout, or the home where the tool was installed."""
 HOME_FILE = "fleet.yml"
 """The file that makes a directory a home; a home that is this checkout has none."""
 
@@ -109,9 +109,9 @@ def _unfit(path: Path) -> bool:
 
 
 def shown(path: Path) -> str:
-    """The path as a message should show it: relative to `CHECKOUT` where it lies inside."""
+    """The path as a message should show it: relative to `WORKPLACE` where it lies inside."""
     try:
-        return str(path.relative_to(CHECKOUT))
+        return str(path.relative_to(WORKPLACE))
     except ValueError:
         return str(path)
 

@@ -30,11 +30,11 @@ def caller(environment: Mapping[str, str] = os.environ) -> Caller | None:
     """None without sudo, and in a checkout that belongs to root."""
     user, group = (environment.get(name, "") for name in ("SUDO_UID", "SUDO_GID"))
     through = os.geteuid() == 0 and user.isdecimal() and group.isdecimal() and int(user) != 0
-    if not through or paths.CHECKOUT.stat().st_uid == 0:
+    if not through or paths.WORKPLACE.stat().st_uid == 0:
         return None
     # Keys elsewhere may belong to root on purpose.
     keys = () if paths.KEYS.exists() and paths.KEYS.stat().st_uid == 0 else (paths.KEYS,)
-    return Caller(int(user), int(group), (paths.CHECKOUT, paths.BUILD, *keys))
+    return Caller(int(user), int(group), (paths.WORKPLACE, paths.BUILD, *keys))
 
 
 def refusal(command: str) -> UserError:
@@ -52,11 +52,11 @@ def hand_back(to: Caller) -> None:
 def left_by_root(error: PermissionError) -> UserError | None:
     """The remedy where root owns the file, or the directory that it is in; None where something else forbids it."""
     file = Path(os.fsdecode(error.filename or "/")).absolute()
-    place = next((each for each in (paths.BUILD, paths.KEYS, paths.CHECKOUT) if file.is_relative_to(each)), None)
+    place = next((each for each in (paths.BUILD, paths.KEYS, paths.WORKPLACE) if file.is_relative_to(each)), None)
     if os.geteuid() == 0 or not place:
         return None
     for each in (file, *file.parents):
-        if each == paths.CHECKOUT:
+        if each == paths.WORKPLACE:
             break
         with suppress(OSError):
             if each.lstat().st_uid == 0:

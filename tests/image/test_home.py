@@ -13,9 +13,7 @@ from flotilla.fleet import home
 from flotilla.fleet.model import Fleet
 from flotilla.images import manifest
 from flotilla.images.build import image_of
-
-KEPT = ("cache", "pool")
-"""Of the outputs those that are named by their content."""
+from tests.image.homes import share_outputs
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +21,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A new home; its outputs share what is named by its content."""
     directory = tmp_path_factory.mktemp("homes") / "lab"
     home.make(directory)
-    (directory / "build").mkdir()
-    for name in KEPT:
-        (directory / "build" / name).symlink_to(paths.BUILD / name)
+    share_outputs(directory)
     return directory
 
 

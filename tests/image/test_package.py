@@ -15,9 +15,8 @@ import pytest
 
 from flotilla.common import paths
 from flotilla.images import manifest, verify
+from tests.image.homes import share_outputs
 
-KEPT = ("cache", "pool")
-"""Of the outputs those that are named by their content."""
 DATA = ("ansible", "examples", "images", "kernel", "rootfs_overlay", "runtime")
 """Folders of the checkout that the package has in flotilla/tool."""
 LEFT_OUT = re.compile(r"runtime/(bench/|tests/|tidy\.py)|.*/\.(ansible-lint|clang-tidy)$")
@@ -34,22 +33,25 @@ def built(checkout: Path, directory: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return built(paths.PROJECT, tmp_path_factory.mktemp("dist"))
+    directory = tmp_path_factory.mktemp("dist")
+    argv = ["make", "-C", str(paths.PROJECT), "wheel", f"OUT={directory}"]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=directory, check=True)
+    (wheel,) = directory.glob("*.whl")
+    return wheel
 
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The program of an environment with nothing but the package and its dependencies."""
     directory = tmp_path_factory.mktemp("installed")
-    locked = (paths.PROJECT / "requirements/station.lock").read_text().splitlines()
-    versions = [line.removesuffix("\\").strip() for line in locked if line[:1].isalnum()]
-    (directory / "constraints.txt").write_text("\n".join(versions))
     uv = [sys.executable, str(paths.PROJECT / "images/pip_settings.py"), str(Path(sys.prefix, "bin/uv"))]
     environment = directory / "environment"
     for words in (
         ["venv", "--quiet", "--python", sys.executable, str(environment)],
         ["pip", "install", "--quiet", "--python", str(environment / "bin/python"), "--constraint",
-         str(directory / "constraints.txt"), f"flotilla[station] @ file://{wheel}"],
+         str(wheel.with_name("constraints.txt")), f"flotilla[station] @ file://{wheel}"],
     ):  # fmt: skip
         done = subprocess.run([*uv, *words], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
@@ -72,9 +74,7 @@ def lab(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         done.stdout
         == f"{directory} is the home of the fleet lab; build its robot's card: cd {directory} && flotilla image 1\n"
     )
-    (directory / "build").mkdir()
-    for name in KEPT:
-        (directory / "build" / name).symlink_to(paths.BUILD / name)
+    share_outputs(directory)
     return directory
 
 

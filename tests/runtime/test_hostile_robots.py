@@ -243,8 +243,8 @@ def play(tmp_path: Path, answers: dict[str, str]) -> Play:
         new = {path for path in new if not str(path).startswith((reports, str(tmp_path / "home") + "/"))}
         inside = {path for path in new if str(path).startswith(own)}
         asked = [json.loads(line) for line in log.read_text().splitlines()]
-        told = json.loads((tmp_path / f"build/reports/{playbook}.json").read_text())["robots"]
-        failed = {name for name, robot in told.items() if robot["outcome"] in ("failed", "unreachable")}
+        reported = json.loads((tmp_path / f"build/reports/{playbook}.json").read_text())["robots"]
+        failed = {name for name, robot in reported.items() if robot["outcome"] in ("failed", "unreachable")}
         return Played(done.stdout + done.stderr, inside, new - inside, asked, failed)
 
     return play

@@ -25,16 +25,16 @@ from flotilla.common.errors import UserError
 
 tmp, needs_root, fails, owner, keys_of = Path(sys.argv[1]), *map(int, sys.argv[2:])
 os.environ |= {"SUDO_UID": "1000", "SUDO_GID": "1001"}
-paths.CHECKOUT, paths.BUILD, paths.KEYS = tmp / "project", tmp / "outputs", tmp / "keys"
+paths.WORKPLACE, paths.BUILD, paths.KEYS = tmp / "project", tmp / "outputs", tmp / "keys"
 paths.check = lambda: None
-for place in (paths.CHECKOUT, paths.BUILD, paths.KEYS, tmp / "elsewhere"):
+for place in (paths.WORKPLACE, paths.BUILD, paths.KEYS, tmp / "elsewhere"):
     place.mkdir()
-os.chown(paths.CHECKOUT, owner, owner)
+os.chown(paths.WORKPLACE, owner, owner)
 os.chown(paths.KEYS, keys_of, keys_of)
 
 
 def work(_):
-    (paths.CHECKOUT / "made").mkdir()
+    (paths.WORKPLACE / "made").mkdir()
     (paths.BUILD / "a b").mkdir()
     (paths.BUILD / "a b" / "image").touch()
     (paths.BUILD / "link").symlink_to(tmp / "elsewhere")
@@ -54,7 +54,7 @@ print(json.dumps([status, owners]))
 def as_root(*argv: str | Path) -> subprocess.CompletedProcess[str]:
     """Root of namespaces, for ordinary users too, which may give files away."""
     return subprocess.run(
-        [*namespace.prefix(), *map(str, argv)], cwd=paths.CHECKOUT, capture_output=True, text=True, check=False
+        [*namespace.prefix(), *map(str, argv)], cwd=paths.WORKPLACE, capture_output=True, text=True, check=False
     )
 
 

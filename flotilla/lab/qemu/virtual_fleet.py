@@ -125,7 +125,7 @@ def up(count: int, link: str | None = None) -> None:
     progress.command(argv)
     with progress.step(f"boot {count} guests") as step, _LOG.open("w") as log:
         process = subprocess.Popen(
-            argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True, cwd=paths.CHECKOUT,
+            argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True, cwd=paths.WORKPLACE,
             start_new_session=True,  # Ctrl-C here is not meant for it
         )  # fmt: skip
         try:
